@@ -11,7 +11,10 @@ backwards through the round, over the *states* in which a span may begin::
 where ``h'`` is the state in which the next span begins. This is the forward-backward recursion of
 hidden Markov models (Rabiner, *A tutorial on hidden Markov models*, 1989), with spans as steps.
 
-Dimensions: P people, B rounds, S states, K values, V views.
+At a span a person goes from a *state* by a value to the next state; such a *course* has a view of
+the span's steps.
+
+Dimensions: P people, B rounds, S states, E courses, V views, D draws.
 """
 
 from __future__ import annotations
@@ -27,32 +30,48 @@ from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.densities import log_latents
 from mirror_ppl.models.human import HumanModel, Implants
 
-NO_VALUE = -1
-"""Index of a value in padding."""
 NEVER = -1e30
 """Log-probability that stands for 0; finite, so that gradients are finite."""
+LEAST = 1e-300
+"""Least probability of a value and all later ones, relative to the most probable value."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """Transitions at the span of one site: from each state, by each value.
+    """Courses through the span of one site.
+
+    States are numbered person by person, courses state by state.
 
     Attributes:
-        view: view of the span's steps, ``[P, S, K]``, an index into the V views.
-        value: the value that leads to it, an index into the site's :meth:`Chain.log_probabilities`,
-            ``[P, S, K]``; ``NO_VALUE`` in padding.
-        following: state in which the next span begins ``[P, S, K]``; unused at the last span.
-        rounds: round of each state ``[P, S]``; ``NO_VALUE`` in padding.
+        state: state in which the span begins ``[E]``, in order.
+        value: the value, an index into the site's :meth:`Chain.log_probabilities`, ``[E]``.
+        view: view of the span's steps ``[E]``, an index into the person's V views.
+        following: state in which the next span begins ``[E]``; unused at the last span.
+        person: person of each state ``[S]``, in order.
+        rounds: round of each state ``[S]``.
     """
 
-    view: Tensor
+    state: Tensor
     value: Tensor
+    view: Tensor
     following: Tensor
+    person: Tensor
     rounds: Tensor
 
-    def at(self, states: Tensor) -> Level:
-        """Select states ``[s]``."""
-        return Level(*(part[:, states] for part in vars(self).values()))
+    def selected(self, states: Tensor) -> tuple[Level, Tensor]:
+        """Select states ``[s]``, in order; also returns the states ``[s']`` that they lead to."""
+        place = _places(states, len(self.person))
+        own = place[self.state] >= 0
+        reached, following = self.following[own].unique(return_inverse=True)
+        level = Level(
+            place[self.state[own]],
+            self.value[own],
+            self.view[own],
+            following,
+            self.person[states],
+            self.rounds[states],
+        )
+        return level, reached
 
 
 @dataclass(frozen=True)
@@ -72,9 +91,21 @@ class Chain:
     covariates: Mapping[str, Tensor] = field(default_factory=dict)
 
     @property
+    def people(self) -> int:
+        """Number of people P."""
+        return int(self.levels[0].person[-1]) + 1
+
+    @property
     def sights(self) -> int:
-        """Number of sights U, padding included."""
-        return self.levels[0].view.shape[1]
+        """Number of sights U of the person with most."""
+        return int(torch.bincount(self.levels[0].person).max())
+
+    @property
+    def places(self) -> Tensor:
+        """Place of each state of the first level among the ``P * U`` sights, ``[S]``."""
+        person = self.levels[0].person
+        begin = torch.searchsorted(person, person)
+        return person * self.sights + torch.arange(len(person), device=person.device) - begin
 
     def log_probabilities(self, human: HumanModel, implants: Implants, rounds: int) -> Tensor:
         """Log-probabilities of values ``[..., P, B, I, 2 n]`` of the I sites.
@@ -86,12 +117,11 @@ class Chain:
             implants: as :meth:`HumanModel.prior` returned them, ``[..., P, 1]``.
             rounds: number of rounds B.
         """
-        people = self.levels[0].view.shape[0]
         most = max(len(support) for support in self.supports.values())
         # Shorter supports are padded with their last value, which is then dropped.
         values = {
             name: torch.cat([support, support[-1:].expand(most - len(support))]).expand(
-                people, rounds, most
+                self.people, rounds, most
             )
             for name, support in self.supports.items()
         }
@@ -108,8 +138,7 @@ class Chain:
         found[next(iter(self.supports))] = added
         for name, support in self.supports.items():
             own = pad(found[name][..., : len(support)], [0, most - len(support)], value=NEVER)
-            later = own.flip(-1).logcumsumexp(-1).flip(-1)
-            parts.append(torch.cat([own, later], -1))
+            parts.append(torch.cat([own, _later(own)], -1))
         return torch.stack(torch.broadcast_tensors(*parts), -2)
 
     def marginal(self, likelihoods: Tensor, log_probabilities: Tensor) -> Tensor:
@@ -119,142 +148,165 @@ class Chain:
             likelihoods: log-likelihood of the recorded actions under each view.
             log_probabilities: see :meth:`log_probabilities`.
         """
+        lead = torch.broadcast_shapes(likelihoods.shape[:-2], log_probabilities.shape[:-4])
+        people, views = likelihoods.shape[-2:]
+        probabilities = draws_last(log_probabilities, lead, 4)
+        likelihood = draws_last(likelihoods, lead, 2).flatten(0, 1)
         after = None
         for number, level in reversed(list(enumerate(self.levels))):
-            score = _taken(likelihoods, level.view) + self.of_level(log_probabilities, number)
+            view = level.person[level.state] * views + level.view
+            score = likelihood.index_select(0, view) + self.of_level(probabilities, number)
             if after is not None:
-                score = score + _taken(after, level.following)
-            score = torch.where(level.value == NO_VALUE, NEVER, score)
-            after = _log_sum_exp(score)
+                score = score + after.index_select(0, level.following)
+            after = log_sums(score, level.state, len(level.person))
         assert after is not None
-        return after
+        found = after.new_full((people * self.sights, after.shape[-1]), NEVER)
+        found = found.index_copy(0, self.places, after)
+        return found.T.reshape(*lead, people, -1).contiguous()
 
-    def of_level(self, log_probabilities: Tensor, number: int) -> Tensor:
-        """Return log-probabilities ``[..., P, S, K]`` of one level's values.
+    def of_level(self, probabilities: Tensor, number: int) -> Tensor:
+        """Return the log-probability ``[E, D]`` of the value of each course of one level.
 
         Args:
-            log_probabilities: those of all levels (:meth:`log_probabilities`).
+            probabilities: :meth:`log_probabilities` of all levels, draws last
+                ``[P, B, I, 2 n, D]``.
             number: of the level.
         """
-        level, own = self.levels[number], log_probabilities[..., number, :]
-        place = level.rounds[..., None].clamp(min=0) * own.shape[-1] + level.value.clamp(min=0)
-        return _taken(own.flatten(-2), place)
+        level, (people, rounds, _, values, _) = self.levels[number], probabilities.shape
+        place = ((level.person * rounds + level.rounds) * values)[level.state] + level.value
+        own = probabilities[:, :, number].reshape(people * rounds * values, -1)
+        return own.index_select(0, place)
 
     def kept(self, sights: Tensor) -> tuple[Chain, Tensor]:
-        """Select sights ``[u]`` of one person; also returns the views ``[v]`` that they lead to."""
+        """Select sights ``[u]`` of one person, in order; also returns their views ``[v]``."""
+        chain = self._selected(sights)
+        views = torch.cat([level.view for level in chain.levels]).unique()
+        return chain.of_views(_places(views, int(views[-1]) + 1)), views
+
+    def _selected(self, sights: Tensor) -> Chain:
         levels, states = [], sights
         for level in self.levels:
-            own = level.at(states)
-            states, following = _renumbered(own.following, own.value != NO_VALUE)
-            levels.append(replace(own, following=following))
-        everywhere = torch.cat([level.view[level.value != NO_VALUE] for level in levels])
-        views = everywhere.unique()
-        place = views.new_zeros(int(views.max()) + 1)
-        place[views] = torch.arange(len(views), device=views.device)
-        return replace(self, levels=tuple(levels)).of_views(place), views
+            own, states = level.selected(states)
+            levels.append(own)
+        return replace(self, levels=tuple(levels))
 
     def of_views(self, place: Tensor) -> Chain:
         """Renumber views: v becomes ``place[v]``."""
-        levels = tuple(
-            replace(
-                one, view=place[torch.where(one.value == NO_VALUE, one.view[0, 0, 0], one.view)]
-            )
-            for one in self.levels
+        return replace(
+            self, levels=tuple(replace(one, view=place[one.view]) for one in self.levels)
         )
-        return replace(self, levels=levels)
 
     def of_person(self, person: int) -> Chain:
         """Select one of the P people."""
-        levels = tuple(
-            Level(*(part[person : person + 1] for part in vars(level).values()))
-            for level in self.levels
-        )
+        (own,) = (self.levels[0].person == person).nonzero(as_tuple=True)
+        alone = self._selected(own)
+        levels = tuple(replace(one, person=torch.zeros_like(one.person)) for one in alone.levels)
         covariates = {name: value[person : person + 1] for name, value in self.covariates.items()}
         return Chain(self.supports, levels, covariates)
 
     @classmethod
     def one_after_another(cls, rounds: Sequence[Chain], views: Sequence[int]) -> Chain:
         """Concatenate the chains of one person's rounds, with ``views`` views each."""
-        begins = [sum(views[:place]) for place in range(len(views))]
-        levels = []
-        for number in range(len(rounds[0].levels)):
-            own = [chain.levels[number] for chain in rounds]
-            behind = [
-                chain.levels[number + 1].view.shape[1] if number + 1 < len(chain.levels) else 0
-                for chain in rounds
-            ]
-            width = max(level.view.shape[-1] for level in own)
-            parts = []
-            for place, (level, begin) in enumerate(zip(own, begins, strict=True)):
-                missing = [0, width - level.view.shape[-1]]
-                parts.append(
-                    (
-                        pad(level.view + begin, missing, value=begin),
-                        pad(level.value, missing, value=NO_VALUE),
-                        pad(level.following + sum(behind[:place]), missing),
-                        torch.full_like(level.rounds, place),
-                    )
+        numbered = []
+        for place, chain in enumerate(rounds):
+            levels = tuple(
+                replace(
+                    one,
+                    view=one.view + sum(views[:place]),
+                    rounds=torch.full_like(one.rounds, place),
                 )
-            levels.append(Level(*(torch.cat(some, 1) for some in zip(*parts, strict=True))))
-        covariates = {
-            name: torch.cat([chain.covariates[name] for chain in rounds], 1)
-            for name in rounds[0].covariates
-        }
-        return cls(rounds[0].supports, tuple(levels), covariates)
+                for one in chain.levels
+            )
+            numbered.append(replace(chain, levels=levels))
+        return _joined(numbered, 1)
 
     @classmethod
     def of_people(cls, people: Sequence[Chain]) -> Chain:
         """Stack the chains of P people, whose covariates have the same number of rounds."""
-        levels = []
-        for own in zip(*(chain.levels for chain in people), strict=True):
-            states = max(level.view.shape[1] for level in own)
-            width = max(level.view.shape[2] for level in own)
-            levels.append(
-                Level(
-                    _padded([level.view for level in own], states, width, 0),
-                    _padded([level.value for level in own], states, width, NO_VALUE),
-                    _padded([level.following for level in own], states, width, 0),
-                    _padded([level.rounds[..., None] for level in own], states, 1, NO_VALUE)[
-                        ..., 0
-                    ],
+        numbered = []
+        for place, chain in enumerate(people):
+            levels = tuple(
+                replace(one, person=torch.full_like(one.person, place)) for one in chain.levels
+            )
+            numbered.append(replace(chain, levels=levels))
+        return _joined(numbered, 0)
+
+
+def _joined(chains: Sequence[Chain], axis: int) -> Chain:
+    """Concatenate chains, whose covariates are joined along an axis."""
+    levels = []
+    for number, own in enumerate(zip(*(chain.levels for chain in chains), strict=True)):
+        last = number + 1 == len(chains[0].levels)
+        states = [len(level.person) for level in own]
+        behind = [0 if last else len(chain.levels[number + 1].person) for chain in chains]
+        parts = [
+            replace(
+                level,
+                state=level.state + sum(states[:place]),
+                following=level.following + sum(behind[:place]),
+            )
+            for place, level in enumerate(own)
+        ]
+        levels.append(
+            Level(
+                *(
+                    torch.cat(some)
+                    for some in zip(*(vars(one).values() for one in parts), strict=True)
                 )
             )
-        covariates = {
-            name: torch.cat([chain.covariates[name] for chain in people])
-            for name in people[0].covariates
-        }
-        return cls(people[0].supports, tuple(levels), covariates)
+        )
+    covariates = {
+        name: torch.cat([chain.covariates[name] for chain in chains], axis)
+        for name in chains[0].covariates
+    }
+    return Chain(chains[0].supports, tuple(levels), covariates)
 
 
-def _padded(parts: Sequence[Tensor], states: int, width: int, fill: int) -> Tensor:
-    """Pad and stack parts ``[1, s, k]`` of P people to ``[P, states, width]``."""
-    return torch.cat(
-        [
-            pad(part, [0, width - part.shape[2], 0, states - part.shape[1]], value=fill)
-            for part in parts
-        ]
-    )
+def draws_last(values: Tensor, lead: Sequence[int], own: int) -> Tensor:
+    """Values ``[..., *own]`` with leading dimensions ``lead`` as one, the last: ``[*own, D]``."""
+    shape = values.shape[values.dim() - own :]
+    return values.expand(*lead, *shape).reshape(-1, *shape).movedim(0, -1).contiguous()
 
 
-def _log_sum_exp(values: Tensor) -> Tensor:
-    """`torch.logsumexp` over the last dimension, in a third of the time if most is padding.
+def log_sums(values: Tensor, groups: Tensor, number: int) -> Tensor:
+    """Log of the sums of exponentials ``[number, D]`` of values ``[E, D]`` in groups ``[E]``."""
+    highest = _highest(values, groups, number)
+    return scaled_sums(values, groups, groups, number, highest).log() + highest
 
-    Terms below e**-80 of the largest are raised to that, because exponentials that underflow are
-    slow.
+
+def scaled_sums(
+    values: Tensor, groups: Tensor, parts: Tensor, number: int, highest: Tensor | None = None
+) -> Tensor:
+    """Sums of exponentials ``[number, D]`` of values ``[E, D]`` in parts ``[E]`` of groups ``[E]``.
+
+    They are relative to the largest exponential of a group. Terms below e**-80 of it are raised to
+    that, because exponentials that underflow are slow.
     """
-    highest = values.amax(-1, keepdim=True).detach()
-    return (values - highest).clamp(min=-80.0).exp().sum(-1).log() + highest.squeeze(-1)
+    if highest is None:
+        highest = _highest(values, groups, int(groups.max()) + 1)
+    scaled = (values - highest.index_select(0, groups)).clamp(min=-80.0).exp()
+    return values.new_zeros(number, values.shape[-1]).index_add(0, parts, scaled)
 
 
-def _taken(values: Tensor, place: Tensor) -> Tensor:
-    """Gather values ``[..., P, n]`` at indices ``[P, S, K]``: ``[..., P, S, K]``."""
-    found = values.gather(-1, place.flatten(-2).expand(*values.shape[:-1], -1))
-    return found.unflatten(-1, place.shape[-2:])
+def _highest(values: Tensor, groups: Tensor, number: int) -> Tensor:
+    """Largest of values ``[E, D]`` in each group, ``[number, D]``."""
+    highest = values.new_full((number, values.shape[-1]), NEVER)
+    return highest.scatter_reduce_(0, groups[:, None].expand_as(values), values.detach(), "amax")
 
 
-def _renumbered(following: Tensor, real: Tensor) -> tuple[Tensor, Tensor]:
-    """Reached states ``[s]``, and ``following`` as indices into them."""
-    states = following[real].unique()
-    place = states.new_zeros(int(following.max()) + 1)
-    place[states] = torch.arange(len(states), device=states.device)
-    return states, torch.where(real, place[following], 0)
+def _later(values: Tensor) -> Tensor:
+    """Log-probability of each of the values ``[..., n]`` or any later one.
+
+    In 64 bits and not by `torch.logcumsumexp`, which takes ten times as long.
+    """
+    wide = values.double()
+    highest = wide.amax(-1, keepdim=True).detach().clamp(min=NEVER)
+    total = (wide - highest).exp().flip(-1).cumsum(-1).flip(-1)
+    return (total.clamp(min=LEAST).log() + highest).to(values.dtype)
+
+
+def _places(chosen: Tensor, number: int) -> Tensor:
+    """Place of each of ``number`` things among those chosen ``[n]``; -1 of others."""
+    place = chosen.new_full((number,), -1)
+    place[chosen] = torch.arange(len(chosen), device=chosen.device)
+    return place

@@ -162,7 +162,7 @@ class _RoundWays:
             self.throughout[site] = values[site]
         width = self.start.memory.observed.shape[1]  # pyright: ignore[reportOptionalMemberAccess]
         self.moments = torch.full((len(parent), width), NO_VIEW, device=parent.device)
-        self._shape = (1, states, span.values)
+        self._shape = (states, span.values)
 
     def _merge(self) -> None:
         """End the span: merge histories that lead to the same state."""
@@ -174,12 +174,16 @@ class _RoundWays:
         index = torch.arange(self._shape[-1], device=device)
         index[-1] += max(len(own) for own in self.supports.values())  # that value or any later
         done = sum(map(len, self.rows))
+        states, values = self._shape
+        of_state = torch.zeros(states, dtype=torch.long, device=device)
         self.levels.append(
             Level(
-                view=done + torch.arange(len(following), device=device).view(self._shape),
-                value=index.expand(self._shape),
-                following=following.view(self._shape),
-                rounds=torch.zeros(self._shape[:2], dtype=torch.long, device=device),
+                state=torch.arange(states, device=device).repeat_interleave(values),
+                value=index.repeat(states),
+                view=done + torch.arange(states * values, device=device),
+                following=following,
+                person=of_state,
+                rounds=of_state,
             )
         )
         self.rows.append(self.moments)

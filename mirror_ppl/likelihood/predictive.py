@@ -13,8 +13,9 @@ import pyro
 import torch
 from pyro import poutine
 from torch import Tensor
+from torch.nn.functional import pad
 
-from mirror_ppl.likelihood.chain import NEVER, NO_VALUE, Chain
+from mirror_ppl.likelihood.chain import NEVER, Chain, draws_last, log_sums, scaled_sums
 from mirror_ppl.likelihood.densities import PLATES, choices, log_weighted_latents
 from mirror_ppl.likelihood.enumeration import conditioned
 from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable
@@ -98,7 +99,7 @@ def _attentive(
         human, implants, attention.values, attention.log_weights, attention.covariates
     )
     # Earlier actions inform about attention.
-    before = torch.nn.functional.pad(along[..., :-1], [1, 0])
+    before = pad(along[..., :-1], [1, 0])
     before = torch.log_softmax(before + attention.shares(weights)[..., None], 2)
     return torch.logsumexp(before[..., None] + found, 2)
 
@@ -113,71 +114,79 @@ def _chained(
         each, chosen = choices(
             human, implants, table.belief, table.values, table.acted, powered=False
         )
-        each = each.expand(number, table.people, *each.shape[-2:])  # [S, P, N, A]
-        chosen = chosen.expand(number, *table.acted.shape)
+        each = draws_last(each, (number,), 3).flatten(0, 1)  # [P * N, A, S]
+        chosen = draws_last(chosen.expand(number, *table.acted.shape), (number,), 2).flatten(0, 1)
         probabilities = chain.log_probabilities(human, implants, table.rounds)
-        probabilities = probabilities.expand(
-            number, table.people, table.rounds, *probabilities.shape[-2:]
-        )
+        probabilities = draws_last(probabilities, (number,), 4)
         sight = table.sight_of(implants).expand(number, table.people, table.rounds)
-    *_, steps = table.recorded.shape
-    actions = each.shape[-1]
-    shape = (number, table.people, table.rounds, steps, actions)
-    found = each.new_full(shape, -math.log(actions))  # in padding
-    for person in range(table.people):
-        alone = chain.of_person(person)
-        own = probabilities[:, person : person + 1]
-        by_level = [alone.of_level(own, level)[:, 0] for level in range(len(alone.levels))]
-        for place in table.real[person].nonzero().flatten().tolist():
-            so_far = each.new_full((number, chain.sights), NEVER)
-            so_far.scatter_(1, sight[:, person, place, None], 0.0)
-            for level, likely in zip(alone.levels, by_level, strict=True):
-                (states,) = (level.rounds[0] == place).nonzero(as_tuple=True)
-                real = level.value[0, states] != NO_VALUE  # [H, K]
-                moments = table.moments[person, level.view[0, states][real]]  # [E, T]
-                log_chance = (likely[:, states] + so_far[:, states, None])[:, real]  # [S, E]
-                now = (moments != NO_VIEW).any(0)
-                if now.any():
-                    done, predicted = _along(
-                        moments[:, now], chosen[:, person], each[:, person], log_chance
-                    )
-                    found[:, person, place, now] = predicted
-                    log_chance = log_chance + done
-                so_far = _gathered(log_chance, level.following[0, states][real])
-    return found
+    (people, rounds, steps), moments = table.recorded.shape, table.acted.shape[-1]
+    actions = each.shape[1]
+    found = each.new_full((people * rounds * steps, actions, number), -math.log(actions))
+    so_far = _first_states(chain, sight, table.real)  # [S', S]
+    for place, level in enumerate(chain.levels):
+        person = level.person[level.state]
+        chance = so_far.index_select(0, level.state) + chain.of_level(probabilities, place)
+        of_view = table.moments[person, level.view]
+        of_view = torch.where(of_view == NO_VIEW, NO_VIEW, of_view + person[:, None] * moments)
+        own = person * rounds + level.rounds[level.state]
+        chance, predicted, predicted_at = _along(of_view, own, chosen, each, chance)
+        found[predicted_at] = predicted
+        if place + 1 < len(chain.levels):
+            so_far = log_sums(chance, level.following, len(chain.levels[place + 1].person))
+    return found.permute(2, 0, 1).unflatten(1, (people, rounds, steps)).contiguous()
+
+
+def _first_states(chain: Chain, sight: Tensor, real: Tensor) -> Tensor:
+    """Log-probabilities ``[S', S]`` of the states in which rounds begin.
+
+    Args:
+        chain: the chain of P people.
+        sight: sight of each draw ``[S, P, B]``.
+        real: False for missing rounds ``[P, B]``.
+    """
+    people, sights = sight.shape[1], chain.sights
+    at = torch.arange(people, device=sight.device)[:, None] * sights + sight
+    found = torch.full((people * sights, len(sight)), NEVER, device=sight.device)
+    found.scatter_(0, at[:, real].T, 0.0)
+    return found[chain.places]
 
 
 def _along(
-    moments: Tensor, chosen: Tensor, each: Tensor, log_chance: Tensor
-) -> tuple[Tensor, Tensor]:
+    moments: Tensor, rounds: Tensor, chosen: Tensor, each: Tensor, chance: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """Forward recursion through the steps of a span.
 
     Args:
-        moments: moments of E courses ``[E, T]``.
-        chosen: log-likelihood of the record at each moment ``[S, N]``.
-        each: log-probability of every action ``[S, N, A]``.
-        log_chance: log-probability of each course before the span ``[S, E]``.
+        moments: moment at each step of E courses ``[E, T]``; ``NO_VIEW`` outside of the span.
+        rounds: round of each course ``[E]``.
+        chosen: log-likelihood of the record at each moment ``[N, S]``.
+        each: log-probability of every action at each moment ``[N, A, S]``.
+        chance: log-probability of each course before the span ``[E, S]``.
 
     Returns:
-        The log-likelihood of each course ``[S, E]``, and log-probabilities ``[S, T, A]`` of
-        actions.
+        Log-probability of each course after the span ``[E, S]``, and log-probabilities
+        ``[G, A, S]`` of actions at the recorded steps ``[G]``, numbered through all rounds.
     """
-    used, which = moments.unique(return_inverse=True)
-    taken = chosen[:, used][:, which]  # [S, E, T]
-    total = taken.cumsum(-1)
-    weights = torch.softmax(total - taken + log_chance[..., None], 1)
-    draws, _, steps = weights.shape
-    # Many courses share moments.
-    place = torch.arange(steps, device=which.device) * len(used) + which
-    share = weights.new_zeros(draws, steps * len(used))
-    share.index_add_(1, place.flatten(), weights.flatten(1))
-    share = share.view(draws, steps, -1)
-    return total[..., -1], (share @ each[:, used].exp()).log()
-
-
-def _gathered(log_chance: Tensor, following: Tensor) -> Tensor:
-    """Log-probabilities ``[S, H]`` of states: sums over courses ``[S, E]`` that lead to them."""
-    highest = log_chance.amax(1, keepdim=True)
-    total = log_chance.new_zeros(len(log_chance), int(following.max()) + 1)
-    total.index_add_(1, following, (log_chance - highest).exp())
-    return total.log().clamp(min=NEVER) + highest
+    lengths, order = (moments != NO_VIEW).sum(1).sort(descending=True, stable=True)
+    moments, rounds, along = moments[order], rounds[order], chance.index_select(0, order)
+    begin, (steps, many) = (moments != NO_VIEW).int().argmax(1), (moments.shape[1], len(each))
+    counts = (lengths > torch.arange(steps, device=order.device)[:, None]).sum(1).tolist()
+    keys, shares = [], []
+    # Step by step, as numbers of one step fit into a cache.
+    for offset, going in enumerate(counts[: counts.index(0)] if 0 in counts else counts):
+        step, own, now = begin[:going] + offset, rounds[:going], along[:going]
+        moment = moments[:going].gather(1, step[:, None])[:, 0]
+        key, place = ((own * steps + step) * many + moment).unique(return_inverse=True)
+        # Many courses share moments.
+        keys.append(key)
+        shares.append(scaled_sums(now, own, place, len(key)))
+        now += chosen.index_select(0, moment)
+    after = torch.empty_like(along).index_copy_(0, order, along)
+    if not keys:
+        return after, each[:0], order[:0]
+    key, share = torch.cat(keys), torch.cat(shares)
+    groups, own = (key // many).unique(return_inverse=True)
+    total = share.new_zeros(len(groups), share.shape[-1]).index_add_(0, own, share)
+    expected = each.new_zeros(len(groups), *each.shape[1:])
+    expected.index_add_(0, own, share[:, None] * each.index_select(0, key % many).exp())
+    return after, (expected / total[:, None]).log(), groups
