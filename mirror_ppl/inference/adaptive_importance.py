@@ -49,6 +49,9 @@ class ImportanceOptions:
             after the first stage.
         prune_margin: nats behind the best, under each of the first draws, at which a combination
             of discrete sites is dropped.
+        resolution: after the first stage, moments of a round are merged if log-probabilities of the
+            recorded actions under likely draws round to the same multiples of this (if there are
+            many moments); 0 for never.
     """
 
     proposals: int = 512
@@ -56,12 +59,13 @@ class ImportanceOptions:
     stages: int = 8
     wider: float = 1.2
     prune_margin: float = 12.0
+    resolution: float = 0.015
 
     def __post_init__(self) -> None:
         # Proposals are fitted to the spread of draws.
         for name, least in (("proposals", 2), ("stages", 0)):
             object.__setattr__(self, name, whole_number(getattr(self, name), name, least))
-        for name in ("enough", "wider", "prune_margin"):
+        for name in ("enough", "wider", "prune_margin", "resolution"):
             object.__setattr__(self, name, real_number(getattr(self, name), name, 0))
 
 
@@ -113,6 +117,8 @@ def adapt(sampler: Sampler, options: ImportanceOptions) -> Weighted:
             return found
         few = found.effective <= FEW
         found = found.tempered(LEARNED_FROM)
+        if stage == 0:
+            sampler.merge(found, options.resolution)
         if not sampler.proposes_residual and (few or stage >= PLAIN_STAGES):
             sampler.learn_residual(found)
         sampler.learn_discrete(found)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import nan
 
 import torch
@@ -39,6 +40,8 @@ def infer_by_importance(
     if models:
         return infer_kinds(job, models, infer_by_importance)
     first_pass = first_pass or _by_importance
+    if job.screening is None:  # nothing is dropped or merged
+        job = replace(job, settings=replace(job.settings, resolution=0.0))
     people, found, drawn = job.rounds.num_people, [], []
     with forked():
         builders = person_builders(job.human, job.rounds, job.screening)

@@ -35,6 +35,7 @@ from mirror_ppl.likelihood.enumeration import (
     log_joints,
     require_acting_on_beliefs,
 )
+from mirror_ppl.likelihood.merged_moments import merged_for
 from mirror_ppl.likelihood.policies import ENOUGH, effective, within
 from mirror_ppl.likelihood.tables import restricted
 from mirror_ppl.likelihood.view_table import ViewTable
@@ -47,6 +48,9 @@ DEFENSIVE_SHARE = 0.1
 """
 RESIDUAL_DRAWS = 64
 """Draws from which the proposal of the residual is fitted."""
+MANY_MOMENTS, MERGING_DRAWS = 8192, 32
+"""Number of moments from which those that likely draws do not tell apart are merged, and the number
+of these draws."""
 
 
 class Proposal(Protocol):
@@ -172,6 +176,22 @@ class Sampler:
             alive = torch.zeros_like(self.table.index[:, 0], dtype=torch.bool)
             alive[0, self.combinations.members] = True
             self.table = restricted(self.table, alive)
+
+    def merge(self, found: Weighted, resolution: float) -> None:
+        """Merge moments that draws from these weighted ones do not tell apart, if there are many.
+
+        Later draws take less time then. Joints of earlier draws stay as they are.
+
+        Args:
+            found: weighted draws.
+            resolution: see `merged_for`; 0 for not merging.
+        """
+        many = self.table.acted.numel() >= MANY_MOMENTS
+        if not (many and resolution) or self.table.attention is not None:
+            return
+        likely = torch.multinomial(found.log_weights.exp(), MERGING_DRAWS, replacement=True)
+        policies = {name: value[likely] for name, value in found.policy.items()}
+        self.table = merged_for(self.human, self.table, policies, resolution)
 
     @property
     def proposes_residual(self) -> bool:

@@ -16,6 +16,7 @@ from mirror_ppl.communication.planners import PlannerOptions
 from mirror_ppl.domains import get_domain
 from mirror_ppl.evaluation.assistance import COMMUNICATORS
 from mirror_ppl.inference.adaptive_importance import PRUNING_DRAWS, ImportanceOptions
+from mirror_ppl.inference.sampler import MANY_MOMENTS, MERGING_DRAWS
 from mirror_ppl.inference.svi import SVIOptions
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.models import HumanModel
@@ -224,6 +225,9 @@ def test_approximations_have_the_tolerances_of_the_page():
     assert f"the same at {SVIOptions().prune_margin:.0f} nats" in text
     assert SVIOptions().prune_margin == ImportanceOptions().prune_margin
     assert f"under {PRUNING_DRAWS} draws of the prior" in text
+    assert f"if {MANY_MOMENTS:,} or more are left" in text
+    assert f"the same under {MERGING_DRAWS} draws near the posterior" in text
+    assert f"on a grid of {ImportanceOptions().resolution} nats" in text
 
 
 def test_quality_of_the_self_model_is_that_of_the_card():
