@@ -1,4 +1,4 @@
-"""Moments that likely policies do not tell apart, merged in tables and while a person is sampled."""
+"""Moments that likely policies do not tell apart, merged in tables and during sampling."""
 
 import pytest
 import torch
