@@ -12,8 +12,8 @@ from mirror_ppl.errors import InputError
 from mirror_ppl.jobs import Runner, TensorFormat
 from mirror_ppl.progress import Report, Reported, silent
 
-PART = 2
-"""People of a part: few, so that processes end at about the same time, and little is lost if they
+PART = 1
+"""People of a part: one, so that processes end at about the same time, and little is lost if they
 are stopped."""
 PEOPLE_OF_A_PROCESS = 4
 """People per process for which starting a further process pays."""

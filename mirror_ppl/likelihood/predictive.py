@@ -23,7 +23,7 @@ from mirror_ppl.models.human import HumanModel
 
 MOST_NUMBERS = 4_000_000
 """Numbers in the beliefs that are gathered at once; bounds memory."""
-DRAWS = 50
+DRAWS = 100
 """Draws for which attention is summed out at once; bounds memory."""
 
 

@@ -103,10 +103,10 @@ def predict_people(
             torch.Generator().manual_seed(PREDICTIVE_STREAM + own_seed)
             for own_seed in seeds[some.start : some.stop]
         ]
-        learned = predict_rounds(human, own, posterior).cpu()
+        learned, expected = _predicted(human, own, (posterior, prior))
         part = Predictions(
             _drawn(learned, generators),
-            _drawn(predict_rounds(human, own, prior).cpu(), generators),
+            _drawn(expected, generators),
             chosen_log_probability(learned, own.to("cpu")).sum(-1),
         )
         found = None
@@ -124,10 +124,24 @@ def predict_people(
             )
             for place, (person, one) in enumerate((one, range(one, one + 1)) for one in some)
         ]
-        del learned, found
+        del learned, expected, found
         parts.append(replace(part, checks=checks))
     report("predict", people, people, "people")
     return Predictions.joined(parts)
+
+
+def _predicted(
+    human: HumanModel, rounds: Demonstrations, draws: Sequence[Mapping[str, Tensor]]
+) -> list[Tensor]:
+    """Predict the same rounds under several sets of draws; see `predict_rounds`.
+
+    Their views are listed once, except where attention is proposed from the draws.
+    """
+    if human.has_round_latents and not human.chained:
+        return [predict_rounds(human, rounds, own).cpu() for own in draws]
+    together = {name: torch.cat([own[name] for own in draws]) for name in draws[0]}
+    numbers = [len(next(iter(own.values()), ())) for own in draws]
+    return list(predict_rounds(human, rounds, together).cpu().split(numbers))
 
 
 def _drawn(log_probabilities: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
