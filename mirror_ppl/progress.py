@@ -135,32 +135,31 @@ class Progress:
 
 
 class Reported(Progress):
-    """Calls a report instead of showing progress, in units of which each step does several.
+    """Calls a report instead of showing progress.
 
     Args:
         name: of the work.
-        total: units in all.
-        each: units of a step; the last one may have fewer.
-        report: called with the units that are done.
+        total: people in all.
+        report: called with the number of people who are done.
     """
 
-    def __init__(self, name: str, total: int, each: int, report: Report) -> None:
+    def __init__(self, name: str, total: int, report: Report) -> None:
         super().__init__(name, total, quiet=True)
-        self._each, self._report = each, report
+        self._report = report
 
     def resume(self, done: int) -> None:
-        """Set the number of steps of an earlier run."""
+        """Set the number of people of an earlier run."""
         super().resume(done)
         self._tell()
 
     def update(self, done: int, message: str = "") -> None:
-        """Report that `done` steps are done in all."""
+        """Report that `done` people are done in all."""
         super().update(done, message)
         self._tell()
 
     def _tell(self) -> None:
         assert self.total is not None
-        self._report(self.name, min(self.done * self._each, self.total), self.total, "people")
+        self._report(self.name, self.done, self.total, "people")
 
 
 class Stages:

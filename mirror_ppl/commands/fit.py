@@ -181,14 +181,12 @@ def _require_memory(demonstrations: Demonstrations, options: Options) -> None:
     """Refuse what will not fit, before any work is done."""
     from mirror_ppl.domains import get_domain
     from mirror_ppl.inference.results.fitting import split_rounds
-    from mirror_ppl.inference.results.posterior_predictive import PEOPLE_AT_ONCE
 
     parts = [part for part in split_rounds(demonstrations, options.train_rounds) if part]
     actions = len(get_domain(demonstrations.domain).actions)
     steps = sum(part.actions[0].numel() for part in parts)
-    people = demonstrations.num_people
-    # Probabilities of actions are kept of held-out rounds; of some people there are copies.
-    values = options.draws * steps * actions * (people + COPIES * min(people, PEOPLE_AT_ONCE))
+    # Probabilities of actions are kept of held-out rounds; of one person there are copies.
+    values = options.draws * steps * actions * (demonstrations.num_people + COPIES)
     require_memory(4 * values, "so many draws of predictions")
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.inference.workers import People, Workers
+from mirror_ppl.inference.workers import PersonAt, Workers
 from mirror_ppl.likelihood.densities import BATCH
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.models.human import HumanModel
@@ -115,9 +115,9 @@ class Job:
             return self
         return replace(self, rounds=self.rounds.select_people(people))
 
-    def part(self, people: People) -> Job:
-        """The job for some of the people, to be sent to another process."""
-        own = self.of(people.range)
+    def part(self, person: PersonAt) -> Job:
+        """The job for one of the people, to be sent to another process."""
+        own = self.of(person.range)
         return replace(own, report=silent, checkpoint=None, workers=Workers())
 
 

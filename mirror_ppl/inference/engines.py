@@ -147,7 +147,7 @@ def infer(  # noqa: PLR0913 - everything that inference can depend on
         checkpoint: a file that is written during the run and resumed from if it exists, and the
             identity of this run (a checkpoint of another run is refused); not used by ``nuts``. For
             many people there are several, with the same prefix. Engines that infer each person
-            separately keep parts of the people in a folder, and leave those of other runs alone.
+            separately keep each of them in a folder, and leave those of other runs alone.
         population: a population estimated from other people, to be the prior of these.
         workers: processes for engines that infer each person separately.
         checked: True if :func:`check_contract` was called already.
@@ -245,7 +245,7 @@ def _each(engine: Engine, job: Job) -> Inferred:
 
 
 def _in_parts(engine: Engine, job: Job) -> Inferred:
-    """Infer people part by part, with an engine that infers each person separately."""
+    """Infer people one by one, with an engine that infers each person separately."""
     identity = "" if job.checkpoint is None else job.checkpoint[1]
     parts = job.workers.run(
         "infer", job.rounds.num_people, partial(_infer_part, engine), job.part, identity

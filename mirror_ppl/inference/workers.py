@@ -12,9 +12,6 @@ from mirror_ppl.errors import InputError
 from mirror_ppl.jobs import Runner, TensorFormat
 from mirror_ppl.progress import Report, Reported, silent
 
-PART = 1
-"""People of a part: one, so that processes end at about the same time, and little is lost if they
-are stopped."""
 PEOPLE_OF_A_PROCESS = 4
 """People per process for which starting a further process pays."""
 
@@ -25,26 +22,24 @@ def parts_of(checkpoint: Path) -> Path:
 
 
 @dataclass(frozen=True)
-class People:
-    """A range of people.
+class PersonAt:
+    """A person by number.
 
     Attributes:
-        first: number of the first person.
-        last: number after that of the last person.
+        number: from 0.
     """
 
-    first: int
-    last: int
+    number: int
 
     @property
     def label(self) -> str:
-        """Name of the range, for progress reports."""
-        return f"people {self.first + 1} to {self.last}"
+        """Name for progress reports."""
+        return f"person {self.number + 1}"
 
     @property
     def range(self) -> range:
-        """Their numbers."""
-        return range(self.first, self.last)
+        """The range of numbers that holds only theirs."""
+        return range(self.number, self.number + 1)
 
 
 @dataclass(frozen=True)
@@ -54,7 +49,7 @@ class Workers:
     Attributes:
         jobs: processes; 1 for this one, -1 for one per core, ``None`` for a suitable number.
         scheduler: address of a Dask cluster to use instead.
-        folder: folder for results of finished parts, from which a stopped run resumes.
+        folder: folder for results of finished people, from which a stopped run resumes.
         report: called with the number of people done.
     """
 
@@ -72,29 +67,31 @@ class Workers:
         name: str,
         people: int,
         work: Callable[[Any], dict[str, Any]],
-        given: Callable[[People], Any],
+        given: Callable[[PersonAt], Any],
         identity: str = "",
     ) -> list[dict[str, Any]]:
-        """Do some work on people 0 to P - 1.
+        """Do some work on people 0 to P - 1, one by one.
+
+        So processes end at about the same time, little is lost if they are stopped, and results of
+        a person do not depend on the others.
 
         Args:
             name: name of the work.
             people: number of people P.
-            work: picklable function of a part's input; returns tensors and plain values.
-            given: makes the input of a part.
+            work: picklable function of a person's input; returns tensors and plain values.
+            given: makes the input of a person.
             identity: identifies everything that results depend on.
 
         Returns:
-            Results of the parts, in order.
+            Results of the people, in order.
         """
-        # Parts have one size everywhere: batching may change results in the last digit.
-        cells = [People(first, min(first + PART, people)) for first in range(0, people, PART)]
+        cells = [PersonAt(number) for number in range(people)]
         runner = Runner(
             self.folder,
             lambda cell: f"{name} {identity}",
             self._processes(people),
             self.scheduler,
-            progress=Reported(name, people, PART, self.report),
+            progress=Reported(name, people, self.report),
         )
         outcomes = runner.run(cells, work, TensorFormat(), given)
         found = [outcome.result for outcome in outcomes]

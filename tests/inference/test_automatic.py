@@ -7,7 +7,7 @@ import torch
 
 import mirror_ppl
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.inference import automatic, workers
+from mirror_ppl.inference import automatic
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions
 from mirror_ppl.inference.amortized import AmortizedOptions
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, reference_places
@@ -83,10 +83,7 @@ def test_each_person_is_judged_alone(toy, recordings, network, monkeypatch):
     assert whole.engines == ("amortized", "importance", "amortized")
 
 
-def test_a_resumed_run_knows_the_engine_of_each_person(
-    toy, recordings, network, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(workers, "PART", 1)
+def test_a_resumed_run_knows_the_engine_of_each_person(toy, recordings, network, tmp_path):
     checkpoint = (tmp_path / "checkpoint", "this run")
 
     def stop(name, done, total, message):

@@ -1,6 +1,6 @@
-"""Predictions of people in groups: those of all at once, whoever else was recorded."""
+"""Predictions of people one by one: the same whoever else was recorded."""
 
-from dataclasses import fields
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +10,6 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.results import posterior_predictive
 from mirror_ppl.inference.results.posterior_predictive import (
     chosen_log_probability,
-    groups,
     predict_rounds,
 )
 from mirror_ppl.inference.results.predictions import _drawn, predict_people
@@ -20,7 +19,7 @@ from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.variants import PerItem
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
-PEOPLE, AT_ONCE = 10, 8
+PEOPLE = 10
 LENGTHS = [[15, 15, 15, 15], [15], [], [7, 15, 2, 1], [15, 15], [1, 1, 1, 1], *[[15, 9, 15]] * 4]
 
 
@@ -41,7 +40,7 @@ def recordings():
 
 @pytest.fixture(scope="module")
 def train(recordings):
-    """Four rounds of 15 steps: those of eight people fill blocks of 32 numbers."""
+    """Up to four rounds of up to 15 steps."""
     return ragged(recordings, LENGTHS)
 
 
@@ -67,62 +66,63 @@ def whole(human, train, test, draws):
     return predict_people(human, (train, test), draws, 3)
 
 
-@pytest.mark.parametrize(
-    ("people", "ends"), [(1, [1]), (2, [2]), (3, [3]), (4, [4]), (5, [3, 5]), (7, [3, 7])]
-)
-def test_a_person_who_is_left_over_joins_the_last_group(monkeypatch, people, ends):
-    monkeypatch.setattr(posterior_predictive, "PEOPLE_AT_ONCE", 3)
-    found = groups(people)
-    assert [number for some in found for number in some] == list(range(people))
-    assert [some.stop for some in found] == ends
+@pytest.mark.parametrize("kind", [HumanModel, PerItem])
+def test_a_persons_predictions_do_not_depend_on_the_others(self_model, train, kind):
+    """Bit for bit, in the padding too."""
+    human = kind(self_model)
+    some = [3, 0, 2]
+    own = draw_prior(human, PEOPLE, 3, 1)
+    found = predict_rounds(human, train, own)
+    assert found.shape == (3, PEOPLE, 4, 15, 2)
+    alone = {name: value[:, some] for name, value in own.items()}
+    again = predict_rounds(human, train.select_people(some), alone)
+    _, _, rounds, steps, _ = again.shape
+    assert torch.equal(again, found[:, some, :rounds, :steps])
 
 
-def test_groups_predict_as_all_people_at_once(monkeypatch, human, train, draws, learned):
-    """Bit for bit, in the padding too, and with the views of no more people in memory."""
-    assert learned.shape == (6, PEOPLE, 4, 15, 2)
-    built, build = [], posterior_predictive.build_view_table
+@pytest.mark.parametrize("kind", [HumanModel, PerItem])
+def test_results_are_of_these_predictions(self_model, train, test, kind, monkeypatch):
+    """Views are listed once for posterior and prior, but where attention is proposed from draws."""
+    human, some = kind(self_model), train.select_people([0, 3])
+    held_out = test.select_people([0, 3])
+    draws = draw_prior(human, 2, 6, 1), draw_prior(human, 2, 4, 2)
+    learned, expected = (predict_rounds(human, some, own) for own in draws)
+    later = predict_rounds(human, held_out, draws[0])
+    listed, build = [], posterior_predictive.build_view_table
 
-    def spy(human, rounds, *args, **kwargs):
-        built.append(rounds.num_people)
-        return build(human, rounds, *args, **kwargs)
+    def spy(human, *given, **named):
+        listed.append(type(human).__name__)
+        return build(human, *given, **named)
 
     monkeypatch.setattr(posterior_predictive, "build_view_table", spy)
-    monkeypatch.setattr(posterior_predictive, "PEOPLE_AT_ONCE", AT_ONCE)
-    assert torch.equal(predict_rounds(human, train, draws[0]), learned)
-    assert built == [8, 2]
+    found = predict_people(human, (some, held_out), draws, 3)
+    assert listed.count(kind.__name__) == 2 * (2 if kind is HumanModel else 3)
+    close = {"rtol": 1e-5, "atol": 1e-4}
+    torch.testing.assert_close(
+        found.log_likelihood, chosen_log_probability(learned, some).sum(-1), **close
+    )
+    torch.testing.assert_close(found.held_out, later.exp(), **close)
+    for one, own in zip(found.scores, score(later, held_out), strict=True):
+        assert one == pytest.approx(own, rel=1e-4)
+    assert found.posterior.shape == learned.shape[:-1] and found.prior.shape == expected.shape[:-1]
 
 
-def test_groups_predict_as_all_people_at_once_where_attention_differs(
-    monkeypatch, self_model, train
-):
-    """Views of a group are padded to its own largest number, so the last digits may differ."""
-    human = PerItem(self_model)
-    some = train.select_people(range(4))
-    own = draw_prior(human, 4, 3, 1)
-    whole = predict_rounds(human, some, own)
-    monkeypatch.setattr(posterior_predictive, "PEOPLE_AT_ONCE", 2)
-    found = predict_rounds(human, some, own)
-    mask = some.mask.expand(3, *some.mask.shape)
-    torch.testing.assert_close(found[mask], whole[mask], rtol=1e-5, atol=1e-5)
-
-
-def test_results_are_of_these_predictions(human, train, test, draws, learned, whole):
-    held_out = predict_rounds(human, test, draws[0])
-    assert torch.equal(whole.log_likelihood, chosen_log_probability(learned, train).sum(-1))
-    assert torch.equal(whole.held_out, held_out.exp())
-    assert whole.scores == score(held_out, test)
-    assert whole.posterior.shape == (6, PEOPLE, 4, 15) and whole.prior.shape == (4, PEOPLE, 4, 15)
-
-
-def test_results_of_groups_are_those_of_all_people(monkeypatch, human, train, test, draws, whole):
-    reports = []
-    monkeypatch.setattr(posterior_predictive, "PEOPLE_AT_ONCE", AT_ONCE)
-    found = predict_people(human, (train, test), draws, 3, lambda *told: reports.append(told))
-    for field in fields(found):
-        one, other = getattr(found, field.name), getattr(whole, field.name)
-        exact = field.name in ("scores", "checks")
-        assert one == other if exact else torch.equal(one, other)
-    assert reports == [("predict", done, PEOPLE, "people") for done in (0, 8, 10)]
+def test_few_prior_and_posterior_draws_are_drawn_from_their_own_predictions(human, recordings):
+    """Of people who hardly err and of people who act at random, whichever is the prior."""
+    one = recordings.select_people([0]).select_rounds([0])
+    random = draw_prior(human, 1, 40, 1)
+    random |= {"consistency": torch.full_like(random["consistency"], 1e-6)}
+    random |= {"residual_out": torch.zeros_like(random["residual_out"])}
+    sure = random | {"consistency": torch.full_like(random["consistency"], 1e4)}
+    sure |= {"lapse": torch.zeros_like(random["lapse"])}
+    for draws in ((sure, random), (random, sure)):
+        found = predict_people(human, (one, None), draws, 0)
+        for drawn, own in zip((found.posterior, found.prior), draws, strict=True):
+            expected = predict_rounds(human, one, own).exp().mean(0)[..., 1]
+            shares = drawn.double().mean(0)
+            # Four standard errors of 40 draws.
+            spread = (expected * (1 - expected) / 40).sqrt() * 4 + 1e-3
+            assert bool(((shares - expected).abs() <= spread).all())
 
 
 def test_predictive_draws_do_not_depend_on_other_people(human, train, draws, whole):
@@ -136,13 +136,21 @@ def test_predictive_draws_do_not_depend_on_other_people(human, train, draws, who
     assert not torch.equal(again.posterior, found.posterior)
 
 
-def test_predictive_draws_follow_the_probabilities():
-    exact = torch.tensor([[0.1, 0.2, 0.7], [0.5, 0.5, 0.0]])  # of two people
-    log_probabilities = exact.log()[None, :, None, None].expand(500, 2, 4, 5, 3)
-    generators = [torch.Generator().manual_seed(number) for number in range(2)]
-    drawn = _drawn(log_probabilities, generators)
-    assert drawn.shape == (500, 2, 4, 5) and drawn.dtype == torch.int8
-    for person, expected in enumerate(exact):
-        often = torch.bincount(drawn[:, person].flatten().long(), minlength=3) / 10_000
-        torch.testing.assert_close(often, expected, atol=0.02, rtol=0)
-    assert not torch.equal(drawn[:, 0], drawn[:, 1])
+@pytest.mark.parametrize("probabilities", [[0.1, 0.2, 0.7], [0.5, 0.5, 0.0]])
+def test_predictive_draws_follow_the_probabilities(probabilities):
+    exact = torch.tensor(probabilities)
+    generator = torch.Generator().manual_seed(0)
+    drawn = _drawn(exact.log()[None, None, None, None].expand(500, 1, 4, 5, 3), generator)
+    assert drawn.shape == (500, 1, 4, 5) and drawn.dtype == torch.int8
+    often = torch.bincount(drawn.flatten().long(), minlength=3) / 10_000
+    torch.testing.assert_close(often, exact, atol=0.02, rtol=0)
+    assert len({tuple(one.flatten().tolist()) for one in drawn}) == 500
+
+
+def test_people_have_predictive_draws_of_their_own(human, recordings):
+    """Twins with different ids."""
+    one = recordings.select_people([0]).select_rounds([0])
+    twin = replace(one, people=("ann",))
+    draws = draw_prior(human, 1, 40, 1)
+    drawn = [predict_people(human, (own, None), (draws, draws), 0).prior for own in (one, twin)]
+    assert not torch.equal(*drawn)

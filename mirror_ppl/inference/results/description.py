@@ -17,7 +17,7 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.population.pooling import Population
 from mirror_ppl.inference.results.identifiability import Identifiability, identify
 from mirror_ppl.inference.results.predictions import Predictions, predict_people
-from mirror_ppl.inference.workers import People, Workers
+from mirror_ppl.inference.workers import PersonAt, Workers
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, draw_prior_of_each
 from mirror_ppl.timing import add_seconds, clocked, stage
@@ -64,12 +64,12 @@ class Description:
 
 @dataclass(frozen=True)
 class Part:
-    """Some people, with their posterior draws.
+    """One person, with their posterior draws.
 
     Attributes:
         train: training rounds.
         test: held-out rounds, if there are any.
-        draws: posterior draws ``[S, P, 1, ...]``.
+        draws: posterior draws ``[S, 1, 1, ...]``.
         combinations: see :func:`describe`.
     """
 
@@ -101,13 +101,13 @@ def describe(
         identity: identifies everything that the result depends on.
     """
 
-    def given(people: People) -> Part:
-        some = slice(people.first, people.last)
+    def given(person: PersonAt) -> Part:
+        own = person.range
         return Part(
-            train.part(people.range),
-            None if test is None else test.part(people.range),
-            {name: value[:, some].clone() for name, value in draws.items()},
-            combinations[some],
+            train.part(own),
+            None if test is None else test.part(own),
+            {name: value[:, [person.number]] for name, value in draws.items()},
+            combinations[own.start : own.stop],
         )
 
     parts = workers.run("describe", train.num_people, partial(_describe, how), given, identity)

@@ -121,8 +121,8 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         seed: seed of all random draws.
         train_rounds: see :func:`split_rounds`.
         report: called with progress.
-        checkpoint: file to resume from; written during the run and never removed. Results of parts
-            of the people are stored in a folder of that name with ``.parts``.
+        checkpoint: file to resume from; written during the run and never removed. Results of single
+            people are stored in a folder of that name with ``.parts``.
         network: network for the engines that take one.
         population: a population estimated from other people, to be the prior of these.
         workers: processes to use; its ``report`` and ``folder`` are replaced.

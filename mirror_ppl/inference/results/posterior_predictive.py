@@ -18,11 +18,6 @@ from mirror_ppl.models.human import HumanModel, has_own_program
 from mirror_ppl.models.prior import checked_draws
 from mirror_ppl.models.recorded import check_rounds
 
-PEOPLE_AT_ONCE = 16
-"""People whose views are in memory together. With a multiple of 16, predictions equal those of all
-people at once bit for bit, if rounds have an even number of steps in all: processors take the
-numbers of an array in blocks of 16 or 32, and may round the rest at its end differently in the last
-digit."""
 PREDICTED_VALUES = 128
 """Sampled values of attention per round in predictions."""
 
@@ -31,6 +26,8 @@ def predict_rounds(
     human: HumanModel, rounds: Demonstrations, draws: Mapping[str, Tensor]
 ) -> Tensor:
     """Log-probabilities ``[S, P, B, T, A]`` of actions, each given the earlier ones of its round.
+
+    People are predicted one by one, so that those of one do not depend on the others.
 
     Args:
         human: the model of people.
@@ -48,21 +45,18 @@ def predict_rounds(
         return Sequential(human, rounds).predict(draws)
     sizes = {site: len(support) for site, support in perceived_sites(human).items()}
     parts = []
-    for some in groups(rounds.num_people):
-        own, recorded = of_people(draws, some), rounds.part(some)
+    for person in range(rounds.num_people):
+        own = {name: value[:, [person]] for name, value in draws.items()}
+        recorded = rounds.part(range(person, person + 1))
         # Only combinations among the draws: exact views, without screening or merging.
-        candidates = [
-            combination_number({site: own[site][:, person, 0] for site in sizes}, sizes)
-            .unique()
-            .to(rounds.actions.device)  # also where there are no sites
-            for person in range(len(some))
-        ]
-        table = build_view_table(human, recorded, candidates, likely=own, values=PREDICTED_VALUES)
+        drawn = combination_number({site: own[site][:, 0, 0] for site in sizes}, sizes).unique()
+        some = [drawn.to(rounds.actions.device)]  # also where there are no sites
+        table = build_view_table(human, recorded, some, likely=own, values=PREDICTED_VALUES)
         parts.append(predict_actions(human, table, own))
         if bool(parts[-1].isnan().any()):
             raise HumanModelError(f"{type(human).__name__}.act returns nan")
         del table
-    return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
+    return torch.cat(parts, 1)
 
 
 def chosen_log_probability(log_probabilities: Tensor, rounds: Demonstrations) -> Tensor:
@@ -70,19 +64,3 @@ def chosen_log_probability(log_probabilities: Tensor, rounds: Demonstrations) ->
     actions = rounds.actions.clamp(min=0).expand(log_probabilities.shape[:-1])
     chosen = log_probabilities.gather(-1, actions[..., None]).squeeze(-1)
     return torch.where(rounds.mask, chosen, 0.0)
-
-
-def groups(people: int) -> list[range]:
-    """Numbers of the people of each group; a single remaining person joins the last group.
-
-    Arrays of a single person are processed in other blocks.
-    """
-    begins = list(range(0, people, PEOPLE_AT_ONCE))
-    if len(begins) > 1 and people - begins[-1] == 1:
-        begins.pop()
-    return [range(*pair) for pair in zip(begins, [*begins[1:], people], strict=True)]
-
-
-def of_people(draws: Mapping[str, Tensor], some: range) -> dict[str, Tensor]:
-    """Select draws ``[S, P', 1, ...]`` of some people."""
-    return {name: value[:, some.start : some.stop] for name, value in draws.items()}

@@ -1,14 +1,13 @@
-"""Predictions and model checks of all people, in groups of a few.
+"""Predictions and model checks of all people, one after the other.
 
 The views of one person's rounds under a hundred draws take up to 13 MB, and log-probabilities of
-actions under all draws another one. To bound memory, people are processed in groups, and only the
-results of each group are kept.
+actions under all draws another one; only what results need is kept.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,13 +17,10 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.results.criticism import criticize
 from mirror_ppl.inference.results.posterior_predictive import (
     chosen_log_probability,
-    groups,
-    of_people,
     predict_rounds,
 )
 from mirror_ppl.inference.results.summary import score
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.progress import Report, silent
 from mirror_ppl.randomness import person_seed
 
 PREDICTIVE_STREAM, CRITICISM_STREAM = 2**31, 2**32
@@ -78,7 +74,6 @@ def predict_people(
     rounds: tuple[Demonstrations, Demonstrations | None],
     draws: tuple[Mapping[str, Tensor], Mapping[str, Tensor]],
     seed: int,
-    report: Report = silent,
 ) -> Predictions:
     """Predict the actions of P people, each given the earlier ones of its round.
 
@@ -90,44 +85,37 @@ def predict_people(
         rounds: training rounds, and held-out rounds, if there are any.
         draws: implants from the posterior ``[S, P, 1, ...]`` and the prior ``[S', P, 1, ...]``.
         seed: seed of predictive draws.
-        report: called with the number of people done.
     """
-    (train, test), parts = rounds, []
-    people = train.num_people
-    seeds = [person_seed(seed, person) for person in train.people]
-    for some in groups(people):
-        report("predict", some.start, people, "people")
-        posterior, prior = (of_people(own, some) for own in draws)
-        own = train.part(some)
-        generators = [
-            torch.Generator().manual_seed(PREDICTIVE_STREAM + own_seed)
-            for own_seed in seeds[some.start : some.stop]
-        ]
-        learned, expected = _predicted(human, own, (posterior, prior))
-        part = Predictions(
-            _drawn(learned, generators),
-            _drawn(expected, generators),
-            chosen_log_probability(learned, own.to("cpu")).sum(-1),
-        )
-        found = None
-        if test is not None:
-            own = test.part(some)
-            found = predict_rounds(human, own, posterior).cpu()
-            part = replace(part, held_out=found.exp(), scores=score(found, own.to("cpu")))
-        checks = [
-            criticize(
-                human,
-                (train.part(one), None if test is None else test.part(one)),
-                (learned[:, place : place + 1], None if found is None else found[:, [place]]),
-                {name: value[:, [place]] for name, value in posterior.items()},
-                CRITICISM_STREAM + seeds[person],
-            )
-            for place, (person, one) in enumerate((one, range(one, one + 1)) for one in some)
-        ]
-        del learned, expected, found
-        parts.append(replace(part, checks=checks))
-    report("predict", people, people, "people")
+    parts = []
+    for number, name in enumerate(rounds[0].people):
+        one = range(number, number + 1)
+        train, test = (None if part is None else part.part(one) for part in rounds)
+        assert train is not None
+        posterior, prior = ({site: own[:, [number]] for site, own in one.items()} for one in draws)
+        parts.append(_predict(human, (train, test), (posterior, prior), person_seed(seed, name)))
     return Predictions.joined(parts)
+
+
+def _predict(
+    human: HumanModel,
+    rounds: tuple[Demonstrations, Demonstrations | None],
+    draws: tuple[Mapping[str, Tensor], Mapping[str, Tensor]],
+    seed: int,
+) -> Predictions:
+    """Predict the actions of one person."""
+    train, test = rounds
+    posterior, _ = draws
+    generator = torch.Generator().manual_seed(PREDICTIVE_STREAM + seed)
+    learned, expected = _predicted(human, train, draws)
+    found = None if test is None else predict_rounds(human, test, posterior).cpu()
+    return Predictions(
+        _drawn(learned, generator),
+        _drawn(expected, generator),
+        chosen_log_probability(learned, train.to("cpu")).sum(-1),
+        None if found is None else found.exp(),
+        None if found is None or test is None else score(found, test.to("cpu")),
+        [criticize(human, rounds, (learned, found), posterior, CRITICISM_STREAM + seed)],
+    )
 
 
 def _predicted(
@@ -144,11 +132,8 @@ def _predicted(
     return list(predict_rounds(human, rounds, together).cpu().split(numbers))
 
 
-def _drawn(log_probabilities: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
-    """Sample actions ``[S, P, B, T]``, int8, from log-probabilities ``[S, P, B, T, A]``."""
-    actions = []
-    for person, generator in enumerate(generators):
-        own = log_probabilities[:, person].exp()
-        drawn = torch.multinomial(own.flatten(0, -2), 1, generator=generator)
-        actions.append(drawn.view(own.shape[:-1]).to(torch.int8))
-    return torch.stack(actions, 1)
+def _drawn(log_probabilities: Tensor, generator: torch.Generator) -> Tensor:
+    """Sample a person's actions ``[S, 1, B, T]``, int8, from ``[S, 1, B, T, A]``."""
+    own = log_probabilities.exp()
+    drawn = torch.multinomial(own.flatten(0, -2), 1, generator=generator)
+    return drawn.view(own.shape[:-1]).to(torch.int8)
