@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 PROGRAM = "python -m mirror_ppl.fit"
 CHECKPOINT = "fit.checkpoint"
 CHECKPOINTS = re.compile(r"fit\.checkpoint(\.\d+)?")
-COPIES = 4
+COPIES = 6
 """Number of copies of log-probabilities of actions in memory while they are drawn from."""
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
 uncertainty of it, and measure how well their held-out actions are predicted. Without --demos the

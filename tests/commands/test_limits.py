@@ -73,7 +73,7 @@ def test_recordings_that_do_not_fit_into_memory_are_refused(tmp_path, capsys):
 def test_draws_that_do_not_fit_into_memory_are_refused(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(limits, "free_memory", lambda: 2**27)
     line = refused(capsys, tmp_path, fit, "--draws", 10_000, "--out", tmp_path / "out")
-    assert "so many draws of predictions would need about 1.5 " in line
+    assert "so many draws of predictions would need about 0.5 " in line
     assert line.endswith("GB of memory, 0.1 GB are free\n")
 
 
