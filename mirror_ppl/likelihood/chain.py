@@ -1,10 +1,10 @@
 """Exact marginalization of attention that is read span by span.
 
 Where each site of ``round_latents`` is read at certain steps only (its
-:class:`~mirror_ppl.models.spans.Span`), attention
-need not be enumerated combination by combination. The values read so far matter only through the
-belief and the knowledge that they led to, and many values lead to the same. The sum therefore runs
-backwards through the round, over the *states* in which a span may begin::
+:class:`~mirror_ppl.models.spans.Span`), attention need not be enumerated combination by
+combination. The values read so far matter only through the belief and the knowledge that they led
+to, and many values lead to the same. The sum therefore runs backwards through the round, over the
+*states* in which a span may begin::
 
     L_i(h) = sum_m p(m_i = m | psi) prod_{t in span i} p(a_t | zH_t(h, m)) L_{i+1}(h'(h, m))
 

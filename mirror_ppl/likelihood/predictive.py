@@ -173,7 +173,9 @@ def _along(
     counts = (lengths > torch.arange(steps, device=order.device)[:, None]).sum(1).tolist()
     keys, shares = [], []
     # Step by step, as numbers of one step fit into a cache.
-    for offset, going in enumerate(counts[: counts.index(0)] if 0 in counts else counts):
+    for offset, going in enumerate(counts):
+        if not going:
+            break
         step, own, now = begin[:going] + offset, rounds[:going], along[:going]
         moment = moments[:going].gather(1, step[:, None])[:, 0]
         key, place = ((own * steps + step) * many + moment).unique(return_inverse=True)
