@@ -13,7 +13,7 @@ from mirror_ppl.data import Demonstrations, concatenate
 from mirror_ppl.domains.bomb_defusal import BombDefusal
 from mirror_ppl.domains.bomb_defusal.human import BombDefusalHuman
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.likelihood.chain import Chain
+from mirror_ppl.likelihood.chain import NEVER, Chain, _later, log_sums
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.enumeration import conditioned, log_joints
 from mirror_ppl.likelihood.predictive import predict_actions
@@ -378,3 +378,24 @@ def test_screening_counts_the_rounds_that_were_added_together(defuser, monkeypat
     for _ in range(2):
         builder.add(rounds_of(recorded(), 0))
     assert counted == [len(ACTIONS), 2 * len(ACTIONS)]
+
+
+def test_later_values_are_exact_far_into_the_tail():
+    own = torch.tensor([[-0.1, -40.0, -300.0, -600.0, -601.0], [-5.0, -0.1, -4.0, NEVER, NEVER]])
+    expected = own.double().flip(-1).logcumsumexp(-1).flip(-1)
+    found = _later(own)
+    torch.testing.assert_close(found[0], expected[0].float())
+    torch.testing.assert_close(found[1, :3], expected[1, :3].float())
+    assert found.isfinite().all() and (found[1, 3:] < -600).all()
+
+
+def test_sums_in_groups_are_those_of_torch_with_gradients():
+    values = 30 * torch.randn(40, 6, generator=torch.Generator().manual_seed(0))
+    groups = torch.arange(40) // 7
+    one, other = (values.clone().requires_grad_() for _ in range(2))
+    found = log_sums(one, groups, 6)
+    expected = torch.stack([other[groups == group].logsumexp(0) for group in range(6)])
+    torch.testing.assert_close(found, expected)
+    found.sum().backward()
+    expected.sum().backward()
+    torch.testing.assert_close(one.grad, other.grad, atol=1e-6, rtol=1e-4)
