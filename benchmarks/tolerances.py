@@ -40,9 +40,10 @@ def main() -> None:
     self_model, _ = load_self_model(shipped_weights("driving"))
     human = HumanModel(self_model)
     bins = len(get_domain("driving").reach_bins)
-    usual = InferenceOptions(draws=800)
+    usual = InferenceOptions("importance", 800)
     careful = InferenceOptions(
-        draws=800,
+        "importance",
+        800,
         settings=ImportanceOptions(prune_margin=40.0),
         screening=Screening(margin=40.0, resolution=0.0),
     )

@@ -21,7 +21,7 @@ PROGRAM = "python -m mirror_ppl.fit"
 CHECKPOINT = "fit.checkpoint"
 CHECKPOINTS = re.compile(r"fit\.checkpoint(\.\d+)?")
 COPIES = 6
-"""Number of copies of log-probabilities of actions in memory while they are drawn from."""
+"""Number of copies of a person's log-probabilities of actions in each process."""
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
 uncertainty of it, and measure how well their held-out actions are predicted. Without --demos the
 recordings of ten simulated people are used that ship with the package. Writes posterior.nc (ArviZ
@@ -181,12 +181,14 @@ def _require_memory(demonstrations: Demonstrations, options: Options) -> None:
     """Refuse what will not fit, before any work is done."""
     from mirror_ppl.domains import get_domain
     from mirror_ppl.inference.results.fitting import split_rounds
+    from mirror_ppl.inference.workers import Workers
 
     parts = [part for part in split_rounds(demonstrations, options.train_rounds) if part]
     actions = len(get_domain(demonstrations.domain).actions)
     steps = sum(part.actions[0].numel() for part in parts)
-    # Probabilities of actions are kept of held-out rounds; of one person there are copies.
-    values = options.draws * steps * actions * (demonstrations.num_people + COPIES)
+    people = demonstrations.num_people
+    processes = Workers(options.jobs).processes(people)
+    values = options.draws * steps * actions * (people + COPIES * processes)
     require_memory(4 * values, "so many draws of predictions")
 
 

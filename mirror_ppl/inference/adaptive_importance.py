@@ -51,7 +51,7 @@ class ImportanceOptions:
             of discrete sites is dropped.
         resolution: after the first stage, moments of a round are merged if log-probabilities of the
             recorded actions under likely draws round to the same multiples of this (if there are
-            many moments); 0 for never.
+            many moments); 0 for never, as where screening is off.
     """
 
     proposals: int = 512
@@ -106,6 +106,8 @@ def sample_importance(
 @torch.no_grad()
 def adapt(sampler: Sampler, options: ImportanceOptions) -> Weighted:
     """Add stages that propose near all weighted draws so far, until enough are effective.
+
+    After the first weighing, many moments are merged (:meth:`Sampler.merge`).
 
     Args:
         sampler: sampler of one person, with some draws. See :func:`sample_importance`.

@@ -84,7 +84,8 @@ class Job:
         draws: number of posterior draws S of each person.
         settings: settings of the engine, see :attr:`Engine.settings`.
         seed: seed of all random draws.
-        screening: when to drop combinations of discrete sites; ``None`` for never.
+        screening: when to drop combinations of discrete sites and to merge moments; ``None`` for
+            never.
         network: network of the amortized guide, if there is one.
         report: called with progress.
         checkpoint: a file that is written during the run and resumed from if it exists, and the
@@ -115,7 +116,7 @@ class Job:
             return self
         return replace(self, rounds=self.rounds.select_people(people))
 
-    def part(self, person: PersonAt) -> Job:
+    def alone(self, person: PersonAt) -> Job:
         """The job for one of the people, to be sent to another process."""
         own = self.of(person.range)
         return replace(own, report=silent, checkpoint=None, workers=Workers())

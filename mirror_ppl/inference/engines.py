@@ -87,8 +87,8 @@ class InferenceOptions:
         draws: number of posterior draws S of each person.
         settings: settings of the engine, such as
             :class:`~mirror_ppl.inference.ImportanceOptions`; by default its own.
-        screening: when to drop combinations of discrete sites; ``None`` for never. The amortized
-            guide has its own.
+        screening: when to drop combinations of discrete sites and to merge moments; ``None`` for
+            never. With a network it has no effect, as the amortized guide has its own.
         pooling: ``none``, or ``partial`` to infer the population together with the people
             (:mod:`mirror_ppl.inference.population.pooling`).
         refine: gradient steps on each person's rounds that refine the network's proposal.
@@ -236,7 +236,7 @@ def _each(engine: Engine, job: Job) -> Inferred:
             "of this human model"
         )
     if engine.each_alone:
-        return _in_parts(engine, job)
+        return _one_by_one(engine, job)
     found = engine.run(job)
     found = replace(found, engines=(engine.name,) * job.rounds.num_people)
     like = next(job.human.parameters())
@@ -244,11 +244,11 @@ def _each(engine: Engine, job: Job) -> Inferred:
     return replace(found, draws=draws)
 
 
-def _in_parts(engine: Engine, job: Job) -> Inferred:
+def _one_by_one(engine: Engine, job: Job) -> Inferred:
     """Infer people one by one, with an engine that infers each person separately."""
     identity = "" if job.checkpoint is None else job.checkpoint[1]
     parts = job.workers.run(
-        "infer", job.rounds.num_people, partial(_infer_part, engine), job.part, identity
+        "infer", job.rounds.num_people, partial(_infer_person, engine), job.alone, identity
     )
     like = next(job.human.parameters())
     drawn = [part["draws"] for part in parts]
@@ -283,19 +283,19 @@ def _joined(parts: Sequence[dict[str, Tensor]], name: str, like: Tensor) -> Tens
     return whole
 
 
-def _infer_part(engine: Engine, part: Job) -> dict[str, Any]:
+def _infer_person(engine: Engine, job: Job) -> dict[str, Any]:
     with clocked() as seconds, stage("infer"):
-        found = engine.run(part)
+        found = engine.run(job)
     return {
         "draws": narrowed(found.draws),
         **{name: getattr(found, name) for name in WEIGHED},
         "combinations": list(found.combinations),
-        "engines": list(found.engines) or [engine.name] * part.rounds.num_people,
+        "engines": list(found.engines) or [engine.name],
         "seconds": seconds,
     }
 
 
-FORMAT = 6
+FORMAT = 7
 """Version of stored runs; raised whenever they change, so that older runs are not resumed."""
 
 

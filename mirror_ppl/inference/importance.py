@@ -40,7 +40,7 @@ def infer_by_importance(
     if models:
         return infer_kinds(job, models, infer_by_importance)
     first_pass = first_pass or _by_importance
-    if job.screening is None:  # nothing is dropped or merged
+    if job.screening is None:  # nothing is merged; pruning has a setting of its own
         job = replace(job, settings=replace(job.settings, resolution=0.0))
     people, found, drawn = job.rounds.num_people, [], []
     with forked():
@@ -78,8 +78,8 @@ def has_evidence(human: HumanModel) -> bool:
     They do not if the program has factors, observed sites, scales or masks, nor if attention is
     sampled, which adds noise that their standard error does not include.
     """
-    drawn_attention = human.has_round_latents and not human.chained
-    return not (adds_to_prior(human) or dependencies(human).adds_to_actions or drawn_attention)
+    added = adds_to_prior(human) or dependencies(human).adds_to_actions
+    return not (added or looks_twice(human))
 
 
 def _by_importance(builder: ViewTableBuilder, options: ImportanceOptions) -> tuple[str, Weighted]:

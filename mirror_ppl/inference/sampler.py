@@ -48,9 +48,10 @@ DEFENSIVE_SHARE = 0.1
 """
 RESIDUAL_DRAWS = 64
 """Draws from which the proposal of the residual is fitted."""
-MANY_MOMENTS, MERGING_DRAWS = 8192, 32
-"""Number of moments from which those that likely draws do not tell apart are merged, and the number
-of these draws."""
+MANY_MOMENTS = 8192
+"""Number of moments from which those are merged that likely draws do not tell apart."""
+MERGING_DRAWS = 32
+"""Number of these draws."""
 
 
 class Proposal(Protocol):

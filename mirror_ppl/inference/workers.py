@@ -17,16 +17,16 @@ PEOPLE_OF_A_PROCESS = 4
 
 
 def parts_of(checkpoint: Path) -> Path:
-    """Folder in which a run with this checkpoint stores results of parts of the people."""
+    """Folder in which a run with this checkpoint stores results of single people."""
     return checkpoint.with_name(f"{checkpoint.name}.parts")
 
 
 @dataclass(frozen=True)
 class PersonAt:
-    """A person by number.
+    """One of the people.
 
     Attributes:
-        number: from 0.
+        number: their place among the people, from 0.
     """
 
     number: int
@@ -38,7 +38,7 @@ class PersonAt:
 
     @property
     def range(self) -> range:
-        """The range of numbers that holds only theirs."""
+        """Their place as a range."""
         return range(self.number, self.number + 1)
 
 
@@ -72,8 +72,8 @@ class Workers:
     ) -> list[dict[str, Any]]:
         """Do some work on people 0 to P - 1, one by one.
 
-        So processes end at about the same time, little is lost if they are stopped, and results of
-        a person do not depend on the others.
+        Thus processes end at about the same time, little is lost if they are stopped, and a
+        person's results do not depend on the others.
 
         Args:
             name: name of the work.
@@ -89,7 +89,7 @@ class Workers:
         runner = Runner(
             self.folder,
             lambda cell: f"{name} {identity}",
-            self._processes(people),
+            self.processes(people),
             self.scheduler,
             progress=Reported(name, people, self.report),
         )
@@ -102,9 +102,12 @@ class Workers:
         """Remove stored results."""
         Runner(self.folder).clean()
 
-    def _processes(self, people: int) -> int:
-        if self.jobs is not None:
+    def processes(self, people: int) -> int:
+        """Number of processes on this machine for that many people."""
+        if self.jobs is not None and self.jobs > 0:
             return self.jobs
-        from joblib import cpu_count
+        from joblib import cpu_count, effective_n_jobs
 
+        if self.jobs is not None:
+            return effective_n_jobs(self.jobs)
         return max(1, min(cpu_count(), math.ceil(people / PEOPLE_OF_A_PROCESS)))

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -29,6 +30,7 @@ from torch.nn.functional import pad
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.densities import log_latents
 from mirror_ppl.models.human import HumanModel, Implants
+from mirror_ppl.shapes import broadcast_shapes
 
 NEVER = -1e30
 """Log-probability that stands for 0; finite, so that gradients are finite."""
@@ -90,17 +92,17 @@ class Chain:
     levels: tuple[Level, ...]
     covariates: Mapping[str, Tensor] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def people(self) -> int:
         """Number of people P."""
         return int(self.levels[0].person[-1]) + 1
 
-    @property
+    @cached_property
     def sights(self) -> int:
         """Number of sights U of the person with most."""
         return int(torch.bincount(self.levels[0].person).max())
 
-    @property
+    @cached_property
     def places(self) -> Tensor:
         """Place of each state of the first level among the ``P * U`` sights, ``[S]``."""
         person = self.levels[0].person
@@ -148,7 +150,7 @@ class Chain:
             likelihoods: log-likelihood of the recorded actions under each view.
             log_probabilities: see :meth:`log_probabilities`.
         """
-        lead = torch.broadcast_shapes(likelihoods.shape[:-2], log_probabilities.shape[:-4])
+        lead = broadcast_shapes(likelihoods.shape[:-2], log_probabilities.shape[:-4])
         people, views = likelihoods.shape[-2:]
         probabilities = draws_last(log_probabilities, lead, 4)
         likelihood = draws_last(likelihoods, lead, 2).flatten(0, 1)
@@ -279,7 +281,8 @@ def scaled_sums(
 ) -> Tensor:
     """Sums of exponentials ``[number, D]`` of values ``[E, D]`` in parts ``[E]`` of groups ``[E]``.
 
-    They are relative to the largest exponential of a group. Terms below e**-80 of it are raised to
+    There are ``number`` parts, each of one group; sums are relative to the largest exponential of
+    that group, whose logarithm is computed unless given. Terms below e**-80 of it are raised to
     that, because exponentials that underflow are slow.
     """
     if highest is None:

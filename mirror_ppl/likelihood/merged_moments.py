@@ -10,7 +10,6 @@ from torch import Tensor
 
 from mirror_ppl.likelihood.policy_likelihoods import PolicyLikelihoods
 from mirror_ppl.likelihood.round_views import ManyViews
-from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.view_table import NO_VIEW, ViewTable
 from mirror_ppl.models.human import HumanModel
 
@@ -28,11 +27,10 @@ def merged_for(
         human: the model of people.
         table: views of one person's rounds, without round latents.
         policies: draws ``[S, 1, 1, ...]`` of the implants that perception does not read.
-        resolution: grid width of log-probabilities, see :class:`Screening`.
+        resolution: grid width of log-probabilities, see `Screening`.
     """
-    views, number = _views(table), len(next(iter(policies.values())))
-    alike = Screening(policies=number, merge_policies=number, resolution=resolution)
-    found, place = PolicyLikelihoods(human, policies, number).merged(views, alike)
+    likelihoods = PolicyLikelihoods(human, policies, len(next(iter(policies.values()))))
+    found, place = likelihoods.merged(_views(table), policies, resolution)
     return replace(
         table,
         index=torch.where(table.index == NO_VIEW, NO_VIEW, place[table.index.clamp(min=0)]),

@@ -42,13 +42,23 @@ class PolicyLikelihoods:
     policies: Mapping[str, Tensor]
     number: int
 
-    def merged(self, views: ManyViews, screening: Screening) -> tuple[ManyViews, Tensor]:
-        """Merge equivalent moments of rounds; also returns the new number of each view."""
+    def merged(
+        self, views: ManyViews, policies: Mapping[str, Tensor], resolution: float
+    ) -> tuple[ManyViews, Tensor]:
+        """Merge moments of rounds that policies do not tell apart.
+
+        Args:
+            views: of rounds.
+            policies: see :meth:`merging`.
+            resolution: see :class:`Screening`.
+
+        Returns:
+            The views, and the new number of each former one ``[V]``.
+        """
         if not len(views.acted):  # padding only
             return views, torch.arange(len(views.moments), device=views.moments.device)
-        policies = self.merging(screening)
         keys = [
-            torch.round(self._of_moments(policies, views, some) / screening.resolution).long().T
+            torch.round(self._of_moments(policies, views, some) / resolution).long().T
             for some in torch.arange(len(views.acted), device=views.acted.device).split(CHUNK)
         ]
         # Moments with different actions stay apart: each has one entry of ``acted``.

@@ -114,14 +114,17 @@ def _chained(
         each, chosen = choices(
             human, implants, table.belief, table.values, table.acted, powered=False
         )
+        each = each.expand(number, table.people, *each.shape[-2:])
         each = draws_last(each, (number,), 3).flatten(0, 1)  # [P * N, A, S]
         chosen = draws_last(chosen.expand(number, *table.acted.shape), (number,), 2).flatten(0, 1)
         probabilities = chain.log_probabilities(human, implants, table.rounds)
         probabilities = draws_last(probabilities, (number,), 4)
         sight = table.sight_of(implants).expand(number, table.people, table.rounds)
+    assert bool((sight[:, table.real] != NO_VIEW).all())  # of the table's combinations
     (people, rounds, steps), moments = table.recorded.shape, table.acted.shape[-1]
     actions = each.shape[1]
     found = each.new_full((people * rounds * steps, actions, number), -math.log(actions))
+    each = each.exp()
     so_far = _first_states(chain, sight, table.real)  # [S', S]
     for place, level in enumerate(chain.levels):
         person = level.person[level.state]
@@ -129,8 +132,7 @@ def _chained(
         of_view = table.moments[person, level.view]
         of_view = torch.where(of_view == NO_VIEW, NO_VIEW, of_view + person[:, None] * moments)
         own = person * rounds + level.rounds[level.state]
-        chance, predicted, predicted_at = _along(of_view, own, chosen, each, chance)
-        found[predicted_at] = predicted
+        chance = _along(of_view, own, chosen, each, chance, found)
         if place + 1 < len(chain.levels):
             so_far = log_sums(chance, level.following, len(chain.levels[place + 1].person))
     return found.permute(2, 0, 1).unflatten(1, (people, rounds, steps)).contiguous()
@@ -152,43 +154,40 @@ def _first_states(chain: Chain, sight: Tensor, real: Tensor) -> Tensor:
 
 
 def _along(
-    moments: Tensor, rounds: Tensor, chosen: Tensor, each: Tensor, chance: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+    moments: Tensor, rounds: Tensor, chosen: Tensor, each: Tensor, chance: Tensor, found: Tensor
+) -> Tensor:
     """Forward recursion through the steps of a span.
 
     Args:
         moments: moment at each step of E courses ``[E, T]``; ``NO_VIEW`` outside of the span.
         rounds: round of each course ``[E]``.
         chosen: log-likelihood of the record at each moment ``[N, S]``.
-        each: log-probability of every action at each moment ``[N, A, S]``.
+        each: probability of every action at each moment ``[N, A, S]``.
         chance: log-probability of each course before the span ``[E, S]``.
+        found: log-probabilities of actions at the recorded steps of all rounds ``[B T, A, S]``, in
+            which those of the span's steps are set.
 
     Returns:
-        Log-probability of each course after the span ``[E, S]``, and log-probabilities
-        ``[G, A, S]`` of actions at the recorded steps ``[G]``, numbered through all rounds.
+        Log-probability of each course after the span ``[E, S]``.
     """
     lengths, order = (moments != NO_VIEW).sum(1).sort(descending=True, stable=True)
     moments, rounds, along = moments[order], rounds[order], chance.index_select(0, order)
-    begin, (steps, many) = (moments != NO_VIEW).int().argmax(1), (moments.shape[1], len(each))
+    begin, (steps, number) = (moments != NO_VIEW).int().argmax(1), (moments.shape[1], len(each))
     counts = (lengths > torch.arange(steps, device=order.device)[:, None]).sum(1).tolist()
-    keys, shares = [], []
     # Step by step, as numbers of one step fit into a cache.
     for offset, going in enumerate(counts):
         if not going:
             break
-        step, own, now = begin[:going] + offset, rounds[:going], along[:going]
+        now, of_round = along[:going], rounds[:going]
+        step = begin[:going] + offset
         moment = moments[:going].gather(1, step[:, None])[:, 0]
-        key, place = ((own * steps + step) * many + moment).unique(return_inverse=True)
         # Many courses share moments.
-        keys.append(key)
-        shares.append(scaled_sums(now, own, place, len(key)))
+        pairs, place = ((of_round * steps + step) * number + moment).unique(return_inverse=True)
+        share = scaled_sums(now, of_round, place, len(pairs))
+        recorded, place = (pairs // number).unique(return_inverse=True)
+        total = share.new_zeros(len(recorded), share.shape[-1]).index_add_(0, place, share)
+        expected = each.new_zeros(len(recorded), *each.shape[1:])
+        expected.index_add_(0, place, share[:, None] * each.index_select(0, pairs % number))
+        found[recorded] = (expected / total[:, None]).log()
         now += chosen.index_select(0, moment)
-    after = torch.empty_like(along).index_copy_(0, order, along)
-    if not keys:
-        return after, each[:0], order[:0]
-    key, share = torch.cat(keys), torch.cat(shares)
-    groups, own = (key // many).unique(return_inverse=True)
-    total = share.new_zeros(len(groups), share.shape[-1]).index_add_(0, own, share)
-    expected = each.new_zeros(len(groups), *each.shape[1:])
-    expected.index_add_(0, own, share[:, None] * each.index_select(0, key % many).exp())
-    return after, (expected / total[:, None]).log(), groups
+    return torch.empty_like(along).index_copy_(0, order, along)

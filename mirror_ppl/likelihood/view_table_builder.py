@@ -32,6 +32,7 @@ from mirror_ppl.likelihood.densities import (
 from mirror_ppl.likelihood.policies import draw_policies, within
 from mirror_ppl.likelihood.policy_likelihoods import PolicyLikelihoods
 from mirror_ppl.likelihood.round_views import (
+    ManyViews,
     Rounds,
     RoundViews,
     views_of_rounds,
@@ -199,7 +200,7 @@ class ViewTableBuilder:
         candidates = {name: value.repeat(len(rounds)) for name, value in candidates.items()}
         views, which = views_of_rounds(self.human, candidates, row, rounds)
         if self.screening is not None and self.screening.resolution > 0:
-            views, place = self._likelihoods.merged(views, self.screening)
+            views, place = self._merged(views, self.screening)
             which = place[which]
         found = None if self.screening is None else self._likelihoods.of_views(views)
         total = torch.zeros(len(self.score), len(alive), device=alive.device)
@@ -228,6 +229,11 @@ class ViewTableBuilder:
         if self.screening is not None:
             self._screen(total, self.screening)
 
+    def _merged(self, views: ManyViews, screening: Screening) -> tuple[ManyViews, Tensor]:
+        """Merge moments that some policies do not tell apart; also the new number of each view."""
+        policies = self._likelihoods.merging(screening)
+        return self._likelihoods.merged(views, policies, screening.resolution)
+
     def _attended_in(self, one: Rounds, proposal: Proposal) -> tuple[AttentionValues, int]:
         """Sampled values of attention in a round, and the round's seed."""
         so_far, actions = one.so_far(0)
@@ -249,7 +255,7 @@ class ViewTableBuilder:
         views, chains = chained_views(self.human, candidates, len(alive), rounds)
         if self.screening is not None and self.screening.resolution > 0:
             before = [own.start for own, _ in views.split()]
-            views, place = self._likelihoods.merged(views, self.screening)
+            views, place = self._merged(views, self.screening)
             begins = [own.start for own, _ in views.split()]
             chains = [
                 chain.of_views(place[first:] - begin)

@@ -124,11 +124,11 @@ def test_what_is_kept_has_a_name(what, recordings):
 def test_processes_are_as_many_as_pay(monkeypatch):
     monkeypatch.setattr("joblib.cpu_count", lambda: 4)
     found = [
-        Workers(None)._processes(people)
+        Workers(None).processes(people)
         for people in (1, PEOPLE_OF_A_PROCESS, PEOPLE_OF_A_PROCESS + 1, 1000)
     ]
     assert found == [1, 1, 2, 4]
-    assert Workers(7)._processes(1) == 7
+    assert Workers(7).processes(1) == 7
     with pytest.raises(InputError, match="jobs must be at least 1, or -1"):
         Workers(0)
 

@@ -399,3 +399,35 @@ def test_sums_in_groups_are_those_of_torch_with_gradients():
     found.sum().backward()
     expected.sum().backward()
     torch.testing.assert_close(one.grad, other.grad, atol=1e-6, rtol=1e-4)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 0, 1)])
+def test_people_without_rounds_and_dropped_combinations_change_nothing_of_others(defuser, order):
+    """Sights and predictions of three people, one of whom played no round, as of each alone."""
+    nobody = replace(
+        recorded(person="nobody"),
+        round_counts=torch.tensor([0]),
+        lengths=torch.zeros(1, len(ACTIONS), dtype=torch.long),
+    )
+    one, other = recorded(), recorded(ACTIONS[:2], told=False, person="other")
+    people = [(one, nobody, other)[place] for place in order]
+    draws = draw_prior(defuser, 3, 5, 0)
+    together = build_view_table(defuser, concatenate(people))
+    alive = torch.ones_like(together.index[:, 0], dtype=torch.bool)
+    alive[order.index(0), 1:] = False  # of one person, only the first combination is left
+    shortened = restricted(together, alive)
+    for place, own in enumerate(people):
+        some = {name: value[:, [place]] for name, value in draws.items()}
+        alone = build_view_table(defuser, own)
+        rounds = int(own.round_counts)
+        expected = log_joints(defuser, alone, some)[:, 0]
+        found = log_joints(defuser, together, draws)[:, place]
+        torch.testing.assert_close(found, expected)
+        left = log_joints(defuser, shortened, draws)[:, place]
+        number = 1 if place == order.index(0) else left.shape[-1]
+        torch.testing.assert_close(left[:, :number], expected[:, :number])
+        steps = own.actions.shape[2]
+        predicted = predict_actions(defuser, together, draws)[:, place, :rounds, :steps]
+        torch.testing.assert_close(
+            predicted, predict_actions(defuser, alone, some)[:, 0, :rounds, :steps]
+        )

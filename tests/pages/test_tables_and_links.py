@@ -226,7 +226,7 @@ def test_approximations_have_the_tolerances_of_the_page():
     assert SVIOptions().prune_margin == ImportanceOptions().prune_margin
     assert f"under {PRUNING_DRAWS} draws of the prior" in text
     assert f"if {MANY_MOMENTS:,} or more are left" in text
-    assert f"the same under {MERGING_DRAWS} draws near the posterior" in text
+    assert f"the same under {MERGING_DRAWS} draws by the weights of that stage" in text
     assert f"on a grid of {ImportanceOptions().resolution} nats" in text
 
 

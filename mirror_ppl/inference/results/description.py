@@ -63,7 +63,7 @@ class Description:
 
 
 @dataclass(frozen=True)
-class Part:
+class OnePerson:
     """One person, with their posterior draws.
 
     Attributes:
@@ -101,9 +101,9 @@ def describe(
         identity: identifies everything that the result depends on.
     """
 
-    def given(person: PersonAt) -> Part:
+    def given(person: PersonAt) -> OnePerson:
         own = person.range
-        return Part(
+        return OnePerson(
             train.part(own),
             None if test is None else test.part(own),
             {name: value[:, [person.number]] for name, value in draws.items()},
@@ -123,21 +123,21 @@ def describe(
     )
 
 
-def _describe(how: Description, part: Part) -> dict[str, Any]:
+def _describe(how: Description, one: OnePerson) -> dict[str, Any]:
     human = how.human
     with clocked() as seconds:
         with stage("predict"):
-            prior = draw_prior_of_each(human, part.train.people, PRIOR_DRAWS, how.seed)
-            rounds = part.train, part.test
-            found = predict_people(human, rounds, (part.draws, prior), how.seed)
+            prior = draw_prior_of_each(human, one.train.people, PRIOR_DRAWS, how.seed)
+            rounds = one.train, one.test
+            found = predict_people(human, rounds, (one.draws, prior), how.seed)
         with stage("identify"):
             unidentified = identify(
                 human,
-                part.train,
-                part.draws,
+                one.train,
+                one.draws,
                 how.seed,
                 how.population,
-                part.combinations,
+                one.combinations,
                 rounds=how.explore,
             )
     if not how.every_draw:

@@ -84,7 +84,7 @@ class Identifiability:
 
     @classmethod
     def joined(cls, parts: Sequence[Mapping[str, Any]]) -> Identifiability:
-        """Concatenate the attributes of parts of the people."""
+        """Concatenate the attributes of several people."""
         tensors = [name for name in parts[0] if name != "sites"]
         return cls(
             tuple(parts[0]["sites"]),

@@ -56,7 +56,7 @@ def predict_rounds(
         if bool(parts[-1].isnan().any()):
             raise HumanModelError(f"{type(human).__name__}.act returns nan")
         del table
-    return torch.cat(parts, 1)
+    return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 
 def chosen_log_probability(log_probabilities: Tensor, rounds: Demonstrations) -> Tensor:

@@ -1,7 +1,7 @@
 """Predictions and model checks of all people, one after the other.
 
-The views of one person's rounds under a hundred draws take up to 13 MB, and log-probabilities of
-actions under all draws another one; only what results need is kept.
+Views of a person's rounds, and log-probabilities of actions under all draws, take much memory; only
+what results need is kept.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from mirror_ppl.inference.results.posterior_predictive import (
     predict_rounds,
 )
 from mirror_ppl.inference.results.summary import score
+from mirror_ppl.inference.second_look import looks_twice
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.randomness import person_seed
 
@@ -125,10 +126,10 @@ def _predicted(
 
     Their views are listed once, except where attention is proposed from the draws.
     """
-    if human.has_round_latents and not human.chained:
+    if looks_twice(human):
         return [predict_rounds(human, rounds, own).cpu() for own in draws]
     together = {name: torch.cat([own[name] for own in draws]) for name in draws[0]}
-    numbers = [len(next(iter(own.values()), ())) for own in draws]
+    numbers = [len(next(iter(own.values()))) for own in draws]
     return list(predict_rounds(human, rounds, together).cpu().split(numbers))
 
 
