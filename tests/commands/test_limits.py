@@ -74,7 +74,7 @@ def test_draws_that_do_not_fit_into_memory_are_refused(tmp_path, capsys, monkeyp
     monkeypatch.setattr(limits, "free_memory", lambda: 2**27)
     options = ("--draws", 10_000, "--jobs", 2, "--out", tmp_path / "out")
     line = refused(capsys, tmp_path, fit, *options)
-    assert "so many draws of predictions would need about 0.7 " in line
+    assert "so many draws of predictions would need about 0.6 " in line
     assert line.endswith("GB of memory, 0.1 GB are free\n")
 
 
