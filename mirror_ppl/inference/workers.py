@@ -49,7 +49,7 @@ class Workers:
     Attributes:
         jobs: processes; 1 for this one, -1 for one per core, ``None`` for a suitable number.
         scheduler: address of a Dask cluster to use instead.
-        folder: folder for results of finished people, from which a stopped run resumes.
+        folder: folder for results of people who are done, from which a stopped run resumes.
         report: called with the number of people done.
     """
 
