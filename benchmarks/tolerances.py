@@ -44,7 +44,7 @@ def main() -> None:
     careful = InferenceOptions(
         "importance",
         800,
-        settings=ImportanceOptions(prune_margin=40.0),
+        settings=ImportanceOptions(prune_margin=40.0, resolution=0.0),
         screening=Screening(margin=40.0, resolution=0.0),
     )
     for population in options.populations:

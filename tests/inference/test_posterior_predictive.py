@@ -12,7 +12,7 @@ from mirror_ppl.inference.results.posterior_predictive import (
     chosen_log_probability,
     predict_rounds,
 )
-from mirror_ppl.inference.results.predictions import _drawn, predict_people
+from mirror_ppl.inference.results.predictions import _drawn, predict_person
 from mirror_ppl.inference.results.summary import score
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.prior import draw_prior
@@ -49,23 +49,6 @@ def test(recordings):
     return recordings.select_rounds([5, 6])
 
 
-@pytest.fixture(scope="module")
-def draws(human):
-    return draw_prior(human, PEOPLE, 6, 1), draw_prior(human, PEOPLE, 4, 2)
-
-
-@pytest.fixture(scope="module")
-def learned(human, train, draws):
-    """Log-probabilities of all people's actions at once."""
-    return predict_rounds(human, train, draws[0])
-
-
-@pytest.fixture(scope="module")
-def whole(human, train, test, draws):
-    """Predictions of all people at once."""
-    return predict_people(human, (train, test), draws, 3)
-
-
 @pytest.mark.parametrize("kind", [HumanModel, PerItem])
 def test_a_persons_predictions_do_not_depend_on_the_others(self_model, train, kind):
     """Bit for bit, in the padding too."""
@@ -81,12 +64,13 @@ def test_a_persons_predictions_do_not_depend_on_the_others(self_model, train, ki
 
 
 @pytest.mark.parametrize("kind", [HumanModel, PerItem])
-def test_results_are_of_these_predictions(self_model, train, test, kind, monkeypatch):
+@pytest.mark.parametrize("person", [0, 3])
+def test_results_are_of_these_predictions(self_model, train, test, kind, person, monkeypatch):
     """Views are listed once for posterior and prior, but where attention is proposed from draws."""
-    human, some = kind(self_model), train.select_people([0, 3])
-    held_out = test.select_people([0, 3])
-    draws = draw_prior(human, 2, 6, 1), draw_prior(human, 2, 4, 2)
-    learned, expected = (predict_rounds(human, some, own) for own in draws)
+    human, own = kind(self_model), train.select_people([person])
+    held_out = test.select_people([person])
+    draws = draw_prior(human, 1, 6, 1), draw_prior(human, 1, 4, 2)
+    learned, expected = (predict_rounds(human, own, some) for some in draws)
     later = predict_rounds(human, held_out, draws[0])
     listed, build = [], posterior_predictive.build_view_table
 
@@ -95,20 +79,20 @@ def test_results_are_of_these_predictions(self_model, train, test, kind, monkeyp
         return build(human, *given, **named)
 
     monkeypatch.setattr(posterior_predictive, "build_view_table", spy)
-    found = predict_people(human, (some, held_out), draws, 3)
-    assert listed.count(kind.__name__) == 2 * (2 if kind is HumanModel else 3)
+    found = predict_person(human, (own, held_out), draws, 3)
+    assert listed.count(kind.__name__) == (2 if kind is HumanModel else 3)
     close = {"rtol": 1e-5, "atol": 1e-4}
     torch.testing.assert_close(
-        found.log_likelihood, chosen_log_probability(learned, some).sum(-1), **close
+        found.log_likelihood, chosen_log_probability(learned, own).sum(-1), **close
     )
     torch.testing.assert_close(found.held_out, later.exp(), **close)
-    for one, own in zip(found.scores, score(later, held_out), strict=True):
-        assert one == pytest.approx(own, rel=1e-4)
+    (scores,), (expected_scores,) = found.scores, score(later, held_out)
+    assert scores == pytest.approx(expected_scores, rel=1e-4)
     assert found.posterior.shape == learned.shape[:-1] and found.prior.shape == expected.shape[:-1]
 
 
 def test_few_prior_and_posterior_draws_are_drawn_from_their_own_predictions(human, recordings):
-    """Of people who hardly err and of people who act at random, whichever is the prior."""
+    """People who hardly err, and people who act at random, whichever are the prior."""
     one = recordings.select_people([0]).select_rounds([0])
     random = draw_prior(human, 1, 40, 1)
     random |= {"consistency": torch.full_like(random["consistency"], 1e-6)}
@@ -116,24 +100,13 @@ def test_few_prior_and_posterior_draws_are_drawn_from_their_own_predictions(huma
     sure = random | {"consistency": torch.full_like(random["consistency"], 1e4)}
     sure |= {"lapse": torch.zeros_like(random["lapse"])}
     for draws in ((sure, random), (random, sure)):
-        found = predict_people(human, (one, None), draws, 0)
+        found = predict_person(human, (one, None), draws, 0)
         for drawn, own in zip((found.posterior, found.prior), draws, strict=True):
             expected = predict_rounds(human, one, own).exp().mean(0)[..., 1]
             shares = drawn.double().mean(0)
             # Four standard errors of 40 draws.
             spread = (expected * (1 - expected) / 40).sqrt() * 4 + 1e-3
             assert bool(((shares - expected).abs() <= spread).all())
-
-
-def test_predictive_draws_do_not_depend_on_other_people(human, train, draws, whole):
-    alone = train.select_people([0, 1])
-    some = tuple({name: value[:, :2] for name, value in own.items()} for own in draws)
-    found = predict_people(human, (alone, None), some, 3)
-    assert found.held_out is None and found.scores is None
-    assert torch.equal(found.posterior, whole.posterior[:, :2])
-    assert torch.equal(found.prior, whole.prior[:, :2])
-    again = predict_people(human, (alone, None), some, 4)
-    assert not torch.equal(again.posterior, found.posterior)
 
 
 @pytest.mark.parametrize("probabilities", [[0.1, 0.2, 0.7], [0.5, 0.5, 0.0]])
@@ -147,10 +120,17 @@ def test_predictive_draws_follow_the_probabilities(probabilities):
     assert len({tuple(one.flatten().tolist()) for one in drawn}) == 500
 
 
-def test_people_have_predictive_draws_of_their_own(human, recordings):
-    """Twins with different ids."""
+def test_predictive_draws_hang_on_the_person_and_the_seed(human, recordings):
+    """Those of a twin with another id differ, too."""
     one = recordings.select_people([0]).select_rounds([0])
     twin = replace(one, people=("ann",))
     draws = draw_prior(human, 1, 40, 1)
-    drawn = [predict_people(human, (own, None), (draws, draws), 0).prior for own in (one, twin)]
-    assert not torch.equal(*drawn)
+    first, again, other, seeded = (
+        predict_person(human, (own, None), (draws, draws), seed)
+        for own, seed in ((one, 0), (one, 0), (twin, 0), (one, 1))
+    )
+    assert first.held_out is None and first.scores is None
+    assert torch.equal(first.prior, again.prior)
+    assert not torch.equal(first.prior, other.prior)
+    assert not torch.equal(first.prior, seeded.prior)
+    assert not torch.equal(first.prior, first.posterior)

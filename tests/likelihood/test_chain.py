@@ -8,12 +8,12 @@ import pyro.distributions as dist
 import pytest
 import torch
 from example_course import gone_through
+from example_defusal import ACTIONS, WAIT, WORLD, recorded
 
-from mirror_ppl.data import Demonstrations, concatenate
-from mirror_ppl.domains.bomb_defusal import BombDefusal
+from mirror_ppl.data import concatenate
 from mirror_ppl.domains.bomb_defusal.human import BombDefusalHuman
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.likelihood.chain import NEVER, Chain, _later, log_sums
+from mirror_ppl.likelihood.chain import Chain
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.enumeration import conditioned, log_joints
 from mirror_ppl.likelihood.predictive import predict_actions
@@ -25,13 +25,6 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel
 
-WORLD = BombDefusal()
-WAIT = 0
-ACTIONS = ((WAIT, WAIT, 1, 2, WAIT, WAIT, 4), (3, WAIT, 1), (WAIT, WAIT))
-"""Rounds that end with the third press, and one that ends before."""
-TELLING = (1, 4)
-"""When the type is told, and when the second terminal is shown, in the first round."""
-
 
 @pytest.fixture(scope="module")
 def defuser():
@@ -41,40 +34,6 @@ def defuser():
         for weight in human.self_model.q_network.parameters():
             weight.mul_(2.0)
     return human
-
-
-def recorded(courses=ACTIONS, told=True, person="somebody"):
-    """Rounds of one person."""
-    rounds, steps = len(courses), max(len(course) for course in courses)
-    actions = torch.full((1, rounds, steps), WAIT)
-    for place, course in enumerate(courses):
-        actions[0, place, : len(course)] = torch.tensor(course)
-    state = WORLD.initial(rounds, torch.Generator().manual_seed(3))
-    observed = [WORLD.observe(state)]
-    for step in range(steps):
-        state = WORLD.transition(state, actions[0, :, step])
-        observed.append(WORLD.observe(state))
-    observation = {name: torch.stack([o[name] for o in observed], 1)[None] for name in observed[0]}
-    heard = {
-        "visual": torch.zeros(1, rounds, steps, 6, dtype=torch.bool),
-        "verbal": torch.zeros(1, rounds, steps, 1, dtype=torch.bool),
-    }
-    if told:
-        heard["verbal"][0, 0, TELLING[0]] = True
-        heard["visual"][0, 0, TELLING[1]] = WORLD.sought(
-            {name: value[0, 0, TELLING[1]] for name, value in observation.items()}
-        )
-    return Demonstrations(
-        domain=WORLD.name,
-        setting="unlabelled",
-        people=(person,),
-        ego=observation.pop("ego"),
-        observations=observation,
-        actions=actions,
-        told=heard,
-        round_counts=torch.tensor([rounds]),
-        lengths=torch.tensor([[len(course) for course in courses]]),
-    )
 
 
 def by_combination(human, rounds, draws):
@@ -378,27 +337,6 @@ def test_screening_counts_the_rounds_that_were_added_together(defuser, monkeypat
     for _ in range(2):
         builder.add(rounds_of(recorded(), 0))
     assert counted == [len(ACTIONS), 2 * len(ACTIONS)]
-
-
-def test_later_values_are_exact_far_into_the_tail():
-    own = torch.tensor([[-0.1, -40.0, -300.0, -600.0, -601.0], [-5.0, -0.1, -4.0, NEVER, NEVER]])
-    expected = own.double().flip(-1).logcumsumexp(-1).flip(-1)
-    found = _later(own)
-    torch.testing.assert_close(found[0], expected[0].float())
-    torch.testing.assert_close(found[1, :3], expected[1, :3].float())
-    assert found.isfinite().all() and (found[1, 3:] < -600).all()
-
-
-def test_sums_in_groups_are_those_of_torch_with_gradients():
-    values = 30 * torch.randn(40, 6, generator=torch.Generator().manual_seed(0))
-    groups = torch.arange(40) // 7
-    one, other = (values.clone().requires_grad_() for _ in range(2))
-    found = log_sums(one, groups, 6)
-    expected = torch.stack([other[groups == group].logsumexp(0) for group in range(6)])
-    torch.testing.assert_close(found, expected)
-    found.sum().backward()
-    expected.sum().backward()
-    torch.testing.assert_close(one.grad, other.grad, atol=1e-6, rtol=1e-4)
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 0, 1)])

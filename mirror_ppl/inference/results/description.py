@@ -16,7 +16,7 @@ from torch import Tensor
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.population.pooling import Population
 from mirror_ppl.inference.results.identifiability import Identifiability, identify
-from mirror_ppl.inference.results.predictions import Predictions, predict_people
+from mirror_ppl.inference.results.predictions import Predictions, predict_person
 from mirror_ppl.inference.workers import PersonAt, Workers
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, draw_prior_of_each
@@ -129,7 +129,7 @@ def _describe(how: Description, one: OnePerson) -> dict[str, Any]:
         with stage("predict"):
             prior = draw_prior_of_each(human, one.train.people, PRIOR_DRAWS, how.seed)
             rounds = one.train, one.test
-            found = predict_people(human, rounds, (one.draws, prior), how.seed)
+            found = predict_person(human, rounds, (one.draws, prior), how.seed)
         with stage("identify"):
             unidentified = identify(
                 human,

@@ -1,4 +1,4 @@
-"""Predictions and model checks of all people, one after the other.
+"""Predictions and model checks of people, one by one.
 
 Views of a person's rounds, and log-probabilities of actions under all draws, take much memory; only
 what results need is kept.
@@ -70,43 +70,24 @@ class Predictions:
 
 
 @torch.no_grad()
-def predict_people(
+def predict_person(
     human: HumanModel,
     rounds: tuple[Demonstrations, Demonstrations | None],
     draws: tuple[Mapping[str, Tensor], Mapping[str, Tensor]],
     seed: int,
 ) -> Predictions:
-    """Predict the actions of P people, each given the earlier ones of its round.
-
-    Each person has their own generator, so that predictive draws do not depend on which other
-    people were recorded, nor on their order.
+    """Predict the actions of one person, each given the earlier ones of its round.
 
     Args:
         human: the model of people.
         rounds: training rounds, and held-out rounds, if there are any.
-        draws: implants from the posterior ``[S, P, 1, ...]`` and the prior ``[S', P, 1, ...]``.
-        seed: seed of predictive draws.
+        draws: implants from the posterior ``[S, 1, 1, ...]`` and the prior ``[S', 1, 1, ...]``.
+        seed: seed of predictive draws; each person has a stream of their own.
     """
-    parts = []
-    for number, name in enumerate(rounds[0].people):
-        one = range(number, number + 1)
-        train, test = (None if part is None else part.part(one) for part in rounds)
-        assert train is not None
-        posterior, prior = ({site: own[:, [number]] for site, own in one.items()} for one in draws)
-        parts.append(_predict(human, (train, test), (posterior, prior), person_seed(seed, name)))
-    return Predictions.joined(parts)
-
-
-def _predict(
-    human: HumanModel,
-    rounds: tuple[Demonstrations, Demonstrations | None],
-    draws: tuple[Mapping[str, Tensor], Mapping[str, Tensor]],
-    seed: int,
-) -> Predictions:
-    """Predict the actions of one person."""
     train, test = rounds
     posterior, _ = draws
-    generator = torch.Generator().manual_seed(PREDICTIVE_STREAM + seed)
+    own = person_seed(seed, train.people[0])
+    generator = torch.Generator().manual_seed(PREDICTIVE_STREAM + own)
     learned, expected = _predicted(human, train, draws)
     found = None if test is None else predict_rounds(human, test, posterior).cpu()
     return Predictions(
@@ -115,7 +96,7 @@ def _predict(
         chosen_log_probability(learned, train.to("cpu")).sum(-1),
         None if found is None else found.exp(),
         None if found is None or test is None else score(found, test.to("cpu")),
-        [criticize(human, rounds, (learned, found), posterior, CRITICISM_STREAM + seed)],
+        [criticize(human, rounds, (learned, found), posterior, CRITICISM_STREAM + own)],
     )
 
 
