@@ -25,9 +25,9 @@ class Preferring(HumanModel):
     opposite. ``prefers_<action>`` is added to the log-probability of an action (of lapses, too)
     before normalization, whatever the action leads to; it is 0 for the first action::
 
-        shares_goal_p ~ Uniform(-1, 1)
-        prefers_a_p   ~ Normal(0, 1.5)
-        p(a | z)      ~ exp(prefers_a) p(a | z, shares_goal * Q(z)), normalized
+        (1 + shares_goal_p) / 2 ~ Beta(2, 1)
+        prefers_a_p             ~ Normal(0, 1.5)
+        p(a | z)                ~ exp(prefers_a) p(a | z, shares_goal * Q(z)), normalized
     """
 
     @property
@@ -42,7 +42,9 @@ class Preferring(HumanModel):
         preferences = {
             site: pyro.sample(site, dist.Normal(0 * one, 1.5 * one)) for site in self.preferences
         }
-        shares = pyro.sample(SHARES_GOAL, dist.Uniform(-one, one))
+        # Most people share the robot's goal: the density rises from 0 at -1 to 1 at 1.
+        shared = dist.AffineBeta(2 * one, one, -one, 2 * one)
+        shares = pyro.sample(SHARES_GOAL, shared)
         return super().prior() | preferences | {SHARES_GOAL: shares}
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
