@@ -7,10 +7,11 @@ import os
 import re
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
-from mirror_ppl.errors import HumanModelError, MirrorError, OptionError
+from mirror_ppl.errors import HumanModelError, MirrorError, MirrorWarning, OptionError
 from mirror_ppl.user_code import describe, passed_user_code
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ def run(
 def guarded(call: Callable[[], int]) -> int:
     """The exit status of a call: its own, or that of how it ended; see `run`."""
     _open_streams()
-    with _terminable():
+    with _terminable(), _warnings_in_one_line():
         try:
             status = call()
             sys.stdout.flush()
@@ -194,6 +195,29 @@ def _terminable() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def _warnings_in_one_line() -> Iterator[None]:
+    """Print the package's warnings without the place in its code that they come from."""
+    usual = warnings.formatwarning
+
+    def formatted(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        line: str | None = None,
+    ) -> str:
+        if issubclass(category, MirrorWarning):
+            return f"warning: {_printable(' '.join(str(message).split()))}\n"
+        return usual(message, category, filename, lineno, line)
+
+    warnings.formatwarning = formatted
+    try:
+        yield
+    finally:
+        warnings.formatwarning = usual
 
 
 def _open_streams() -> None:

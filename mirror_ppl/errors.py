@@ -145,25 +145,33 @@ class CheckpointError(MirrorError):
     """
 
 
-class StaleSelfModel(UserWarning):
+class MirrorWarning(UserWarning):
+    """Base class of the package's warnings; commands print them in one line."""
+
+
+class StaleSelfModel(MirrorWarning):
     """Warns that a user's world has changed since its self-model was trained."""
 
 
-class LacksSitesOfWorld(UserWarning):
+class LacksSitesOfWorld(MirrorWarning):
     """Warns that a human model is not derived from the one that its world needs."""
 
 
-class MisspeltMember(UserWarning):
+class MisspeltMember(MirrorWarning):
     """Warns that a method of a user's class overrides none, but almost has the name of one."""
 
 
-class UnexplainedPerson(UserWarning):
+class UnreadSite(MirrorWarning):
+    """Warns that no method of a user's human model reads some sites that its prior samples."""
+
+
+class UnexplainedPerson(MirrorWarning):
     """Warns that messages are planned for a person whose actions the model does not explain."""
 
 
-class PriorConflict(UserWarning):
+class PriorConflict(MirrorWarning):
     """Warns that a prior is at odds with most of the people."""
 
 
-class UnreliableWeights(UserWarning):
+class UnreliableWeights(MirrorWarning):
     """Warns that a person's importance weights are not reliable."""

@@ -113,6 +113,11 @@ def is_of_package(thing: object) -> bool:
     )
 
 
+def is_own_method(thing: object, name: str) -> bool:
+    """True if a user wrote a method of an object, in its class or in the object itself."""
+    return not _functions_from_libraries([getattr(thing, name)])
+
+
 def _functions_from_libraries(values: Iterable[Any]) -> bool:
     for value in values:
         # Properties and bound, static and class methods hold the function.

@@ -16,6 +16,7 @@ from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.errors import PosteriorError
 from mirror_ppl.inference.results.posterior_file import POSTERIOR, posterior_at, read_results
 from mirror_ppl.models.loading import model_name
+from mirror_ppl.models.simulation import OWN_HUMAN_MODEL
 
 GROUPS = {
     "loo": ("log_likelihood", "observed_data", "constant_data"),
@@ -246,19 +247,22 @@ def _check_two(first: ComparedFile, other: ComparedFile) -> None:
     expected, given = source_of(first), source_of(other)
     # The shortest difference is reported, rather than that of the command that recorded.
     # Where domains differ, everything else does, too.
+    own = f"{SOURCE}{OWN_HUMAN_MODEL}"  # the name of the population says more
     names = sorted(
         {*expected, *given},
-        key=lambda name: (name != "domain", len(expected.get(name, "")), name),
+        key=lambda name: (name != "domain", name == own, len(expected.get(name, "")), name),
     )
     different = f"{other.path}: is of other recordings than {first.path}:"
     for name in names:
         if given.get(name) != expected.get(name):
             raise PosteriorError(
-                f"{different} {name} is {given.get(name)}, expected {expected.get(name)}"
+                f"{different} {name.removeprefix(SOURCE)} is {given.get(name, 'none')}, expected "
+                f"{expected.get(name, 'none')}"
             )
     if other.people != first.people:
         raise PosteriorError(
-            f"{different} people are {', '.join(other.people)}, expected {', '.join(first.people)}"
+            f"{different} people are {', '.join(other.people)}, expected "
+            f"{', '.join(first.people)}; fit the same people with --people"
         )
     for name, value in first.recorded.items():
         # A variable that one of the files lacks cannot contradict the other.

@@ -165,9 +165,13 @@ class Sampler:
         """Drop combinations that are behind the best by more than ``margin`` nats under every draw.
 
         Draws have to be from the prior. None is dropped if the program adds factors or observed
-        sites under which too few of the draws are effective.
+        sites under which too few of the draws are effective, or if one is impossible under some
+        draws and possible under others.
         """
         joint, said = torch.cat(self._joints), torch.cat(self._corrections)
+        impossible = joint.isneginf()
+        if bool((impossible.any(0) & ~impossible.all(0)).any()):
+            return
         if float(said.max() - said.min()) > 0 and effective(said) < min(ENOUGH, len(said) / 2):
             return
         keep = within(self.human, joint + said[:, None], margin)
@@ -206,7 +210,9 @@ class Sampler:
         """
         if SITE not in found.policy or not self.table.real.any():
             return
-        best = found.log_weights.topk(min(RESIDUAL_DRAWS, len(found.log_weights))).indices
+        # Under draws that the recorded actions rule out, moments have no expected counts.
+        possible = int((found.log_weights > -torch.inf).sum())
+        best = found.log_weights.topk(min(RESIDUAL_DRAWS, possible)).indices
         counts = expected_counts(
             self.human,
             self.table,
@@ -317,6 +323,9 @@ class Sampler:
             raise HumanModelError(
                 "the recorded actions have probability 0 under all draws of the implants: act() "
                 "has to give every recorded action some probability, as lapses do"
+                if bool((joint == -math.inf).all())
+                else "factors or observed sites of the model have probability 0 under all draws of "
+                "the implants that allow the recorded actions: prior() has to leave some possible"
             )
         weights = (target - mixture).double()
         log_weights, pareto_k = pareto_smoothed(weights)

@@ -30,6 +30,7 @@ from mirror_ppl.likelihood.densities import (
 )
 from mirror_ppl.likelihood.enumeration import conditioned
 from mirror_ppl.models.belief_tracking import BeliefState, Transition
+from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel, at_step, messages_at, recorded_covariates
 from mirror_ppl.models.prior import Draws, draw_prior
 from mirror_ppl.models.sites import latent_sites, sample_nodes
@@ -80,6 +81,11 @@ def _check_each_alone(human: HumanModel) -> None:
     draws = draw_prior(human, 2, COMPARED, SEED)
     together, again = (_said_by_site(human, draws, COMPARED, 2, seed) for seed in range(2))
     for (method, name), value in together.items():
+        if bool(value.isnan().any() or (name in draws and value.isinf().any())):
+            raise HumanModelError(
+                f'the log density of "{name}" in {method} is not finite: check the parameters of '
+                "its distribution"
+            )
         if not torch.equal(value, again[method, name]):
             raise HumanModelError(
                 f'{method} says something else of "{name}" when it is run again: whatever is '
@@ -106,6 +112,26 @@ def _check_each_alone(human: HumanModel) -> None:
                         "as in factor(x.sum()), adds them up (sum over event dimensions alone), "
                         "and Python's `if` on values decides for all of them"
                     )
+
+
+@torch.no_grad()
+def unused_sites(human: HumanModel) -> list[str]:
+    """Sites of ``prior`` on which nothing else depends, so that their posterior is their prior.
+
+    Neither provenance nor different values show that something depends on them.
+    """
+    found = dependencies(human)
+    used = frozenset(perceived_sites(human)).union(
+        found.actions, *found.prior.values(), *found.round_latents.values()
+    )
+    draws = draw_prior(human, 2, COMPARED, SEED)
+    usual = _said_by_site(human, draws, COMPARED, 2)
+
+    def matters(name: str) -> bool:
+        other = _said_by_site(human, draws | {name: draws[name].roll(1, 0)}, COMPARED, 2)
+        return any(not usual[key].equal(other[key]) for key in usual.keys() - {("prior", name)})
+
+    return [name for name in draws if name not in used and not matters(name)]
 
 
 def _said_by_site(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Iterable, Mapping
-from dataclasses import is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,14 @@ from torch.distributions import Independent, biject_to
 from mirror_ppl.checks import require_kind
 from mirror_ppl.domains import Domain
 from mirror_ppl.domains.record import require_power
-from mirror_ppl.errors import HumanModelError, MirrorError
-from mirror_ppl.likelihood.agreement import check_agreement
+from mirror_ppl.errors import HumanModelError, MirrorError, UnreadSite
+from mirror_ppl.likelihood.agreement import check_agreement, unused_sites
 from mirror_ppl.likelihood.combinations import forget
 from mirror_ppl.likelihood.densities import PLATES, check_plates, log_prob, sample_nodes
 from mirror_ppl.likelihood.span_contract import check_spans_hold
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel, Implants, has_own_program, overrides
+from mirror_ppl.models.implants import sight_sites
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
 from mirror_ppl.models.view import View
 from mirror_ppl.randomness import forked, seed_everything
@@ -56,6 +58,9 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
     Raises:
         HumanModelError: a method fails or returns the wrong thing; names the method and the line.
         InputError: its power of the likelihood is none.
+
+    Warns:
+        UnreadSite: no method reads some sites of the prior.
     """
     require_kind(human, HumanModel, "human")
     domain = human.domain
@@ -90,8 +95,10 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                     f"prior returned {type(implants).__name__}, expected a dict of sites by name"
                 )
             _check_returned("prior", implants, latent_sites(trace.trace))
+            _check_sites(trace.trace, people)
+            _check_sight(domain, trace.trace)
             method = "round_latents"
-            latents = _round_latents(human, implants, people)
+            latents = _round_latents(human, _Returned("round_latents", implants), people)
             for name in set(latents) & set(latent_sites(trace.trace)):
                 raise HumanModelError(f'"{name}" is a site of prior() and of round_latents()')
             sampled = latent_values(trace.trace)
@@ -103,7 +110,7 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
             belief = next(human.parameters()).new_zeros(people, human.belief_size)
             method = "nothing_known"
             knowledge: Any = human.nothing_known(people, device=device)
-            _check_knowledge("nothing_known returned {}", knowledge)
+            _check_knowledge("nothing_known returned {}", knowledge, people)
             for step, now in enumerate(observed):
                 with WithoutSites(BELIEVING):
                     readable = Readable(discrete | latents, implants.keys())
@@ -114,7 +121,7 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                     view, knowledge = _perceived(
                         human.perceive(readable, knowledge, now, told, step)
                     )
-                    _check_knowledge("perceive returned {} as knowledge", knowledge)
+                    _check_knowledge("perceive returned {} as knowledge", knowledge, people)
                     method = "evidence"
                     evidence = human.evidence(view, now)
                     method = "believe"
@@ -128,21 +135,46 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                     )
                 _check_dtype(human, "believe", belief)
                 method = "act"
-                _check_act(human, implants, belief)
+                _check_act(human, _Returned("act", implants), belief)
+        _refuse_parameters(trace.trace)
         _check_names(domain, [*latent_sites(trace.trace), *latents])
         method = "spans"
         if human.chained:
             check_spans_hold(human, {name: value[:1] for name, value in discrete.items()})
-        _check_sites(trace.trace, people)
+        unused: list[str] = []
         if not has_own_program(human):
             method = "model"
             check_agreement(human)
+            unused = unused_sites(human)
     except MirrorError:
         raise
     except (Exception, SystemExit) as error:
         file = getattr(sys.modules.get(type(human).__module__), "__file__", None)
         where = describe(error, None if file is None else Path(file))
         raise HumanModelError(f"{type(human).__name__}.{method} fails: {where}") from error
+    if unused:
+        names = ", ".join(f'"{name}"' for name in unused)
+        warnings.warn(
+            f"no method of {type(human).__name__} reads {names}, so that the posterior is the "
+            "prior: return each site from prior() by its name, and read it in perceive, sees or "
+            "act, or leave it out",
+            UnreadSite,
+            stacklevel=4,  # of no_grad, too
+        )
+
+
+class _Returned(dict[str, Tensor]):
+    """What ``prior`` returned, for another method, which may read something else."""
+
+    def __init__(self, method: str, implants: Implants) -> None:
+        super().__init__(implants)
+        self.method = method
+
+    def __missing__(self, name: str) -> Tensor:
+        raise HumanModelError(
+            f'{self.method} reads "{name}", which prior() does not return; start from '
+            "super().prior()"
+        )
 
 
 def _perceived(found: Any) -> tuple[View, Any]:
@@ -158,11 +190,16 @@ def _perceived(found: Any) -> tuple[View, Any]:
     )
 
 
-def _check_knowledge(what: str, knowledge: Any) -> None:
+def _check_knowledge(what: str, knowledge: Any, people: int) -> None:
     """Check that knowledge is a dataclass, as its tensors are selected by people."""
     if not is_dataclass(knowledge):
         found = what.format(type(knowledge).__name__)
         raise HumanModelError(f"{found}, expected a dataclass of tensors")
+    for field in fields(knowledge):
+        part = getattr(knowledge, field.name)
+        if torch.is_tensor(part) and part.shape[:1] != (people,):
+            found = what.format(f"{field.name} of shape {tuple(part.shape)}")
+            raise HumanModelError(f"{found}, expected ({people}, ...) for {people} people")
 
 
 def _check_sees(domain: Domain, masks: Any, people: int) -> None:
@@ -339,6 +376,18 @@ def _check_sites(trace: poutine.Trace, people: int) -> None:
                 f'what "{name}" can be depends on another site; sample it from 0 to 1, say, and '
                 "stretch it where it is read"
             )
+
+
+def _check_sight(domain: Domain, trace: poutine.Trace) -> None:
+    """Refuse thresholds of sight with more values than there are bins."""
+    latent, bins = latent_sites(trace), len(domain.reach_bins)
+    for name in sight_sites(domain):
+        if name in latent and latent[name]["fn"].has_enumerate_support:
+            values = len(latent[name]["fn"].enumerate_support(expand=False))
+            if values > bins:
+                raise HumanModelError(
+                    f'"{name}" has {values} values, but {domain.name} has {bins} reach_bins'
+                )
 
 
 def _refuse_distribution(name: str, fn: Any) -> None:

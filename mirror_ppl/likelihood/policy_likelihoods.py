@@ -57,12 +57,15 @@ class PolicyLikelihoods:
         """
         if not len(views.acted):  # padding only
             return views, torch.arange(len(views.moments), device=views.moments.device)
-        keys = [
-            torch.round(self._of_moments(policies, views, some) / resolution).long().T
-            for some in torch.arange(len(views.acted), device=views.acted.device).split(CHUNK)
-        ]
+        every = torch.arange(len(views.acted), device=views.acted.device)
+        found = torch.cat(
+            [self._of_moments(policies, views, some).T for some in every.split(CHUNK)]
+        )
+        # Where an action is impossible under a policy, nothing is known of similar policies.
+        alone = torch.where(found.isneginf().any(-1), every + 1, 0)
+        key = torch.round(found / resolution).nan_to_num(neginf=0.0).long()
         # Moments with different actions stay apart: each has one entry of ``acted``.
-        key = torch.cat([torch.cat(keys), views.acted[:, None]], -1)
+        key = torch.cat([key, views.acted[:, None], alone[:, None]], -1)
         first, cluster = distinct_in_groups(key, views.rounds)
         moments = views.moments
         moments = torch.where(moments == NO_VIEW, NO_VIEW, cluster[moments.clamp(min=0)])

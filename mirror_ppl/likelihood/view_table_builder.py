@@ -2,7 +2,8 @@
 
 Every combination of the discrete implants is a candidate. After some rounds, candidates are dropped
 whose likelihood is far below the best one's under every policy. Later rounds need no views of them,
-and exact marginalization stays cheap.
+and exact marginalization stays cheap. From the first round on that is impossible under a policy and
+candidate, none is dropped.
 """
 
 from __future__ import annotations
@@ -165,6 +166,8 @@ class ViewTableBuilder:
         # The policies that distinguish moments suffice to distinguish rounds.
         policies = self._likelihoods.merging(self.screening)
         found = self._likelihoods.of_views(views, policies)[:, which].unflatten(-1, (number, -1))
+        if bool(found.isneginf().any()):
+            return None
         prior = (self.score + self.log_prior)[: len(found), some]
         return telling_first(found, prior, self.screening.margin_after(1))
 
@@ -202,7 +205,9 @@ class ViewTableBuilder:
         if self.screening is not None and self.screening.resolution > 0:
             views, place = self._merged(views, self.screening)
             which = place[which]
-        found = None if self.screening is None else self._likelihoods.of_views(views)
+        found = (
+            None if self.screening is None else self._possible(self._likelihoods.of_views(views))
+        )
         total = torch.zeros(len(self.score), len(alive), device=alive.device)
         for one, (own, part), seen in zip(
             rounds.each(), views.split(), which.view(len(rounds), number), strict=True
@@ -265,14 +270,16 @@ class ViewTableBuilder:
         every = torch.arange(len(alive), device=alive.device)
         for one, chain, (_, part) in zip(rounds.each(), chains, parts, strict=True):
             self._take(one, replace(part, chain=chain), every, alive)
-        if self.screening is not None:
-            likelihoods = self._likelihoods.of_views(views)[:, None]
+        found = (
+            None if self.screening is None else self._possible(self._likelihoods.of_views(views))
+        )
+        if found is not None and self.screening is not None:
             together = Chain.one_after_another(chains, [len(part.moments) for _, part in parts])
             with self._likelihoods.conditioned():
                 probabilities = together.log_probabilities(
                     self.human, self.human.prior(), len(rounds)
                 )
-            found = together.marginal(likelihoods, probabilities)[:, 0]
+            found = together.marginal(found[:, None], probabilities)[:, 0]
             self._screen(found.unflatten(-1, (len(rounds), -1)).sum(1), self.screening)
 
     def _take(self, one: Rounds, part: RoundViews, seen: Tensor, alive: Tensor) -> None:
@@ -280,6 +287,16 @@ class ViewTableBuilder:
         self._rounds.append(part)
         self._seen.append((alive, seen))
         self._recorded.append((one.actions[0], one.real[0]))
+
+    def _possible(self, found: Tensor) -> Tensor | None:
+        """Return log-likelihoods if none is minus infinity; else no candidate is dropped any more.
+
+        Under other policies than these, what is impossible here may be the most probable.
+        """
+        if bool(found.isneginf().any()):
+            self.screening = None
+            return None
+        return found
 
     def _screen(self, found: Tensor, screening: Screening) -> None:
         """Add log-likelihoods ``[policies, M']`` of those alive; drop those far behind."""

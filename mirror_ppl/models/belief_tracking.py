@@ -129,7 +129,7 @@ class BeliefState:
 
     def key(self) -> Tensor:
         """Return whole numbers ``[n, ...]``, equal where belief and knowledge are equal."""
-        known = [part.flatten(1) for part in tensors_of(self.knowledge)]
+        known = [part[..., None].flatten(1) for part in tensors_of(self.knowledge)]
         floats = [part for part in known if part.is_floating_point()]
         known = [part.long() for part in known if not part.is_floating_point()]
         if floats:

@@ -34,6 +34,8 @@ PRIOR_OF = "prior of "
 """Prefix of the population's name in recordings of people drawn from a human model's prior."""
 OWN_HUMAN_MODEL = "own_human_model"
 """Attribute that marks human models which do not come with this package, whatever their names."""
+OWN_SIGHT = "own_sight"
+"""Attribute with the method, ``sees`` or ``perceive``, by which such a model's people see."""
 
 
 @torch.no_grad()

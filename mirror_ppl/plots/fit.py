@@ -95,7 +95,7 @@ class FitPlots:
     def files(self) -> Iterator[tuple[str, Picture, str]]:
         """Draw the pictures that a fit writes, each with its file name and description."""
         for name, picture in sight.sight_pictures(self.data).items():
-            yield name, picture.draw(self.data), picture.shows
+            yield name, sight.drawn(picture, self.data), picture.shows
         if self.data["model_check"].sizes["check"]:
             yield CHECK, self.check(), "whether the model explains each person"
         if self._has_identifiability():
@@ -122,7 +122,7 @@ class FitPlots:
         known = sight.pictures_of(self.data)
         for name in names:
             if name in known and known[name].possible(self.data):
-                return known[name].draw(self.data)
+                return sight.drawn(known[name], self.data)
         raise InputError(
             f"there is no picture {names[0].removesuffix('.png')} of "
             f"{self.data['posterior'].attrs.get('human_model')} in "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -25,6 +25,8 @@ TRUTH = "truth_"
 # Okabe and Ito's colours, which people of any colour vision can distinguish.
 BLUE, ORANGE, PURPLE, BLACK, GREY = "#0072B2", "#E69F00", "#CC79A7", "#000000", "#8a8a8a"
 POSTERIOR, PRIOR, TRUE, OBSERVED = BLUE, GREY, ORANGE, BLACK
+TITLE: dict[str, Any] = {"x": 0.01, "ha": "left", "fontsize": 14, "fontweight": "bold"}
+"""How the title of a picture of people is written."""
 
 
 def edged(width: float = 3.2, colour: str = "white") -> list[AbstractPathEffect]:
@@ -114,11 +116,5 @@ def explain(figure: Figure, data: az.InferenceData, title: str, shown: int, lege
     setting = data["posterior"].attrs.get("setting")
     everybody = len(people(data))
     some = "" if shown == everybody else f" (the first {shown} of {everybody} people)"
-    figure.suptitle(
-        f"{title}{f', {setting}' if setting else ''}{some}",
-        x=0.01,
-        ha="left",
-        fontsize=14,
-        fontweight="bold",
-    )
+    figure.suptitle(f"{title}{f', {setting}' if setting else ''}{some}", **TITLE)
     figure.supxlabel(legend, x=0.01, ha="left", fontsize=9)

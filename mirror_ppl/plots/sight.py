@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 from mirror_ppl.domains import Record, get_domain
 from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.models.simulation import OWN_SIGHT
 from mirror_ppl.plots import reach
 from mirror_ppl.plots.notices import NOTICES_PICTURE
-from mirror_ppl.plots.picture import SightPicture
+from mirror_ppl.plots.picture import Picture, SightPicture
+from mirror_ppl.plots.reading import TITLE
 
 if TYPE_CHECKING:
     import arviz as az
@@ -27,6 +29,16 @@ OF_ANY_WORLD: Mapping[str, SightPicture] = {
 def sight_pictures(data: az.InferenceData) -> dict[str, SightPicture]:
     """Pictures of what each person sees that can be drawn, by file name."""
     return {name: picture for name, picture in pictures_of(data).items() if picture.possible(data)}
+
+
+def drawn(picture: SightPicture, data: az.InferenceData) -> Picture:
+    """Draw a picture of sight; its title says so if a user's human model has its own sight."""
+    figure, attributes = picture.draw(data), data["posterior"].attrs
+    if method := attributes.get(OWN_SIGHT):
+        own = f"{attributes['human_model']}.{method}()"
+        lines = (figure.get_suptitle(), f"Thresholds alone: {own} decides what people see")
+        figure.suptitle("\n".join(lines), **TITLE)
+    return figure
 
 
 def pictures_of(data: az.InferenceData) -> Mapping[str, SightPicture]:

@@ -144,13 +144,13 @@ OTHERWISE = np.where((ACTIONS >= 0) & (np.arange(4) == 0), 1, ACTIONS).astype("i
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"recorded_seed": "7"}, "recorded_seed is 7, expected 0"),
-        ({"recorded_seed": None}, "recorded_seed is None, expected 0"),
-        ({"recorded_by": "me"}, "recorded_by is me, expected None"),
+        ({"recorded_seed": "7"}, "seed is 7, expected 0"),
+        ({"recorded_seed": None}, "seed is none, expected 0"),
+        ({"recorded_by": "me"}, "by is me, expected none"),
         # The short name comes before the long command.
         (
             {"recorded_command": "x", "recorded_population": "diverse"},
-            "recorded_population is diverse, expected paper",
+            "population is diverse, expected paper",
         ),
         ({"setting": "clear"}, "setting is clear, expected fog"),
         ({"domain": "kitchen"}, "domain is kitchen, expected driving"),
@@ -174,7 +174,7 @@ def test_other_people(paths, tmp_path, capsys, monkeypatch):
     other = write(tmp_path / "other.nc", np.zeros((4, 3)))
     assert refused(capsys, tmp_path, paths[0], other) == (
         f"{other}: is of other recordings than {paths[0]}: people are ana, ben, dia, cem, "
-        "expected ana, ben, cem, dia"
+        "expected ana, ben, cem, dia; fit the same people with --people"
     )
 
 

@@ -127,6 +127,7 @@ def test_weights_of_sets_are_those_of_all_combinations(self_model, one):
     assert (share - probabilities).abs().max() < 5 * (0.25 / 4000) ** 0.5
 
 
+@pytest.mark.filterwarnings("ignore::mirror_ppl.errors.UnreadSite")
 def test_rare_policies_stay_rare(self_model, one):
     for seed in range(3):
         found = infer(Cautious(self_model), one, InferenceOptions(draws=400), seed).draws

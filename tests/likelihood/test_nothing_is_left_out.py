@@ -181,6 +181,7 @@ def test_distributions_that_engines_cannot_treat_are_refused(self_model, own, me
         check_contract(human)
 
 
+@pytest.mark.filterwarnings("ignore::mirror_ppl.errors.UnreadSite")
 def test_a_scaled_discrete_site_is_drawn_by_importance_alone(self_model):
     human, rounds = Drawing(self_model), load_recordings().select_people([0]).select_rounds([0])
     human.own, human.scale = dist.Categorical(torch.ones(3) / 3), 0.3
@@ -189,6 +190,7 @@ def test_a_scaled_discrete_site_is_drawn_by_importance_alone(self_model):
             infer(human, rounds, InferenceOptions(engine, 4), 0)
 
 
+@pytest.mark.filterwarnings("ignore::mirror_ppl.errors.UnreadSite")
 def test_sites_of_several_numbers_keep_their_precision(self_model):
     """Eight significant bits cannot represent 1000 with a standard deviation of .5."""
     human, nobody = Drawing(self_model), load_recordings().select_people([0]).select_rounds([])
@@ -207,10 +209,46 @@ class Torn(HumanModel):
         return torch.where(torch.arange(2) == 0, 0.0, -torch.inf).expand_as(found)
 
 
+@pytest.mark.filterwarnings("ignore::mirror_ppl.errors.UnreadSite")
 def test_recorded_actions_without_probability_are_reported(self_model):
     rounds = load_recordings().select_people([0]).select_rounds([0, 1])
     with pytest.raises(HumanModelError, match="recorded actions have probability 0"):
         infer(Torn(self_model), rounds, InferenceOptions("importance", 20), 0)
+
+
+class Strict(HumanModel):
+    """Never does what is less probable than one in seven."""
+
+    def act(self, implants, belief, values):
+        found = super().act(implants, belief, values)
+        return found.masked_fill(found < -2, -torch.inf).log_softmax(-1)
+
+
+def test_what_recorded_actions_rule_out_under_some_policies_is_kept(self_model):
+    """Under others it may be the most probable; what they rule out in each case has no weight."""
+    rounds = load_recordings().select_people([0]).select_rounds([0, 1])
+    human = Strict(self_model)
+    found = infer(human, rounds, InferenceOptions("importance", 50), 0)
+    assert (found.pareto_k < 0.7).all()
+    assert compile(human, rounds).log_joint(found.draws).isfinite().all()
+    plain = infer(human, rounds, InferenceOptions("importance", 50, screening=None), 0)
+    # The same draws; steps are merged on a grid of .03 nats.
+    torch.testing.assert_close(found.log_evidence, plain.log_evidence, rtol=0, atol=0.1)
+
+
+class Impossible(HumanModel):
+    """A factor that no draw of the prior satisfies."""
+
+    def prior(self):
+        found = super().prior()
+        pyro.factor("steady", torch.where(found["consistency"] > 1000, 0.0, -torch.inf))
+        return found
+
+
+def test_factors_without_probability_are_reported(self_model):
+    rounds = load_recordings().select_people([1]).select_rounds([0])
+    with pytest.raises(HumanModelError, match=r"^person-02: factors or observed sites .* prior"):
+        infer(Impossible(self_model), rounds, InferenceOptions("importance", 20), 0)
 
 
 class Hard(HumanModel):

@@ -1,7 +1,8 @@
 """Tracked beliefs, against the recursion of the human model for each person by itself."""
 
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import pytest
 import torch
@@ -198,6 +199,33 @@ def test_before_the_first_step_there_is_one_belief(case):
     assert own.tolist() == [0] * 5 and state.mean.shape == (1, human.belief_size)
     assert not state.believed.any()
     assert state.step == 0
+
+
+@dataclass
+class Remembered:
+    """What is on the road, and one number for each person ``[n]``."""
+
+    cars: Any
+    lane: torch.Tensor
+
+
+class RemembersLane(HumanModel):
+    """Has a memory of its own."""
+
+    def nothing_known(self, *batch, device=None):
+        lane = torch.zeros(batch, dtype=torch.long, device=device)
+        return Remembered(super().nothing_known(*batch, device=device), lane)
+
+
+def test_people_who_remember_different_numbers_are_distinct():
+    human = RemembersLane(load_self_model(shipped_weights("driving"))[0])
+    state = BeliefState.initial(human, 3)
+    lanes = torch.tensor([1, 0, 1])
+    for lane in (lanes, lanes.float(), lanes[:, None]):
+        own = replace(state, knowledge=replace(state.knowledge, lane=lane))
+        first, other, same = own.distinct()[1].tolist()
+        assert first == same != other
+    assert len(state.at(slice(0)).distinct()[1]) == 0
 
 
 def test_what_many_observe_is_worked_out_once():

@@ -1,6 +1,7 @@
 """Human models of users: that they are used as they are, and what is refused."""
 
 import textwrap
+import warnings
 
 import pytest
 import torch
@@ -17,7 +18,7 @@ from example_implants import (
 )
 
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.errors import HumanModelError, MisspeltMember
+from mirror_ppl.errors import HumanModelError, MisspeltMember, UnreadSite
 from mirror_ppl.inference.svi import SVIOptions, fit_implants
 from mirror_ppl.likelihood.compiled import ViewTables
 from mirror_ppl.likelihood.contract import check_contract
@@ -240,7 +241,43 @@ def test_what_is_not_a_human_model_is_refused(tmp_path, monkeypatch, human, spec
             r'perceive\(\) reads "lapse", which is not a discrete site of prior\(\)',
         ),
         ("act(self, implants, belief, values)", "return values", "they do not sum to 1"),
-        ("act(self, implants, belief, values)", 'return implants["mood"]', "KeyError: 'mood'"),
+        (
+            "act(self, implants, belief, values)",
+            'return implants["mood"]',
+            r'act reads "mood", which prior\(\) does not return; start from super\(\)\.prior\(\)',
+        ),
+        (
+            "prior(self)",
+            'kept = super().prior(); del kept["lapse"]; return kept',
+            'act reads "lapse", which prior',
+        ),
+        (
+            "round_latents(self, implants)",
+            'return {"mood": implants["mood"]}',
+            'round_latents reads "mood", which prior',
+        ),
+        (
+            "prior(self)",
+            'return super().prior() | {"mood": pyro.sample("mood", dist.Normal(0.0, 1e30))}',
+            'the log density of "mood" in prior is not finite: check the parameters',
+        ),
+        (
+            "prior(self)",
+            'return super().prior() | {"mood": pyro.sample("mood", dist.Uniform(0.0, torch.inf))}',
+            'the log density of "mood" in prior is not finite',
+        ),
+        (
+            "prior(self)",
+            'name = "sight_front_own"; hidden = pyro.poutine.block(super().prior, hide=[name])(); '
+            "return hidden | {name: pyro.sample(name, dist.Categorical(torch.ones(9)))}",
+            '"sight_front_own" has 9 values, but driving has 7 reach_bins',
+        ),
+        (
+            "nothing_known(self, *batch, device=None)",
+            "import dataclasses; known = super().nothing_known(*batch, device=device); "
+            "return dataclasses.replace(known, position=torch.zeros(()))",
+            r"nothing_known returned position of shape \(\), expected \(2, \.\.\.\) for 2 people",
+        ),
         (
             "act(self, implants, belief, values)",
             'return values + pyro.sample("mood", dist.Beta(1.0, 4.0))[..., None]',
@@ -279,6 +316,41 @@ def test_a_broken_contract_is_reported_before_any_work(tmp_path, human, method, 
     with pytest.raises(HumanModelError, match=message):
         check_contract(mine)
     assert torch.equal(torch.random.get_rng_state(), state)
+
+
+@pytest.mark.parametrize(
+    ("returned", "used", "said"),
+    [
+        ("{}", "", ["mood"]),
+        ('{"tiredness": mood}', "", ["mood"]),
+        ('{"mood": mood}', "", ["mood"]),
+        ('{"mood": mood}', 'found = found + 0.1 * implants["mood"][..., None]', []),
+        # Provenance is lost where a value is assigned.
+        ('{"mood": mood}', 'found[..., :1] = implants["mood"][..., None]', []),
+        ('{"other": pyro.sample("other", dist.Normal(mood, 1.0))}', "", ["other"]),
+        ('{"other": pyro.sample("other", dist.Normal(0.0, 1.0))}', "", ["mood", "other"]),
+    ],
+)
+def test_a_site_that_nothing_reads_is_named(tmp_path, human, returned, used, said):
+    code = f"""
+        class Mine(HumanModel):
+            def prior(self):
+                mood = pyro.sample("mood", dist.Normal(0.0, 1.0))
+                return super().prior() | {returned}
+
+            def act(self, implants, belief, values):
+                found = super().act(implants, belief, values).clone()
+                {used}
+                return found.log_softmax(-1)
+        """
+    mine = user_model(tmp_path, human, code, "Mine")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        check_contract(mine)
+    names = ", ".join(f'"{name}"' for name in said)
+    expected = [f"no method of Mine reads {names}, so that the posterior is the prior"]
+    assert [str(one.message).partition(":")[0] for one in told] == expected[: len(said)]
+    assert all(one.category is UnreadSite for one in told)
 
 
 def test_a_misspelt_method_is_named(tmp_path, human):

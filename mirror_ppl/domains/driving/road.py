@@ -20,7 +20,17 @@ from matplotlib.patches import FancyBboxPatch, Polygon, Rectangle
 from mirror_ppl.domains.driving.knowledge import ROAD_END
 from mirror_ppl.models.implants import SIGHT
 from mirror_ppl.plots.picture import Picture
-from mirror_ppl.plots.reading import BLUE, TRUE, draws, edged, name_of, of_person, people, truth
+from mirror_ppl.plots.reading import (
+    BLUE,
+    TITLE,
+    TRUE,
+    draws,
+    edged,
+    name_of,
+    of_person,
+    people,
+    truth,
+)
 
 if TYPE_CHECKING:
     import arviz as az
@@ -162,13 +172,7 @@ def sight_picture(data: az.InferenceData) -> Picture:
     place = " in ".join(attributes[key] for key in ("domain", "setting") if key in attributes)
     place = f": {place}" if place else ""
     some = "" if shown == everybody else f" (the first {len(shown)} of {len(everybody)} people)"
-    figure.suptitle(
-        f"What each person sees of the road{place}{some}",
-        x=0.01,
-        ha="left",
-        fontsize=14,
-        fontweight="bold",
-    )
+    figure.suptitle(f"What each person sees of the road{place}{some}", **TITLE)
     truth_known = any(true_sight(data, person) is not None for person in shown)
     _explain(figure, list(grid.flat), truth_known)
     return figure

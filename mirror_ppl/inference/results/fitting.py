@@ -27,12 +27,12 @@ from mirror_ppl.models.family import KIND, OneOfKinds
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import in_units
 from mirror_ppl.models.recorded import check_rounds
-from mirror_ppl.models.simulation import OWN_HUMAN_MODEL
+from mirror_ppl.models.simulation import OWN_HUMAN_MODEL, OWN_SIGHT
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.models.world_knowledge import fit_world
 from mirror_ppl.progress import Report, silent
 from mirror_ppl.timing import add_seconds
-from mirror_ppl.user_code import is_of_package
+from mirror_ppl.user_code import is_of_package, is_own_method
 from mirror_ppl.version import __version__
 
 if TYPE_CHECKING:
@@ -243,6 +243,8 @@ def _attributes(
     }
     if not is_of_package(human):
         own[OWN_HUMAN_MODEL] = 1
+        methods = [name for name in ("sees", "perceive") if is_own_method(human, name)]
+        own |= {OWN_SIGHT: methods[0]} if methods else {}
     return own | {f"recorded_{name}": value for name, value in train.provenance.items()}
 
 
