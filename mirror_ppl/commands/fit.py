@@ -131,6 +131,7 @@ def main(options: Options) -> None:
     from mirror_ppl.face import infer
     from mirror_ppl.files import output_folder
     from mirror_ppl.fitted import RESULTS
+    from mirror_ppl.inference.results.posterior_file import POSTERIOR
     from mirror_ppl.inference.svi import SVIOptions
     from mirror_ppl.inference.workers import Workers, parts_of
 
@@ -138,6 +139,7 @@ def main(options: Options) -> None:
     engine = told_engine(options.guide)
     allowed = share(options.allow_contradictions, "--allow-contradictions")
     _require_memory(recordings, options)
+    replaced = "; it replaces an earlier one" if (options.out / POSTERIOR).exists() else ""
     results = output_folder(options.out, (*RESULTS, CHECKPOINT), parts=[f"{CHECKPOINT}.parts"])
     with results as folder, Stages() as stages, warnings.catch_warnings():
         for reported in (PriorConflict, UnreliableWeights):
@@ -171,7 +173,8 @@ def main(options: Options) -> None:
             if CHECKPOINTS.fullmatch(file.name) and file.is_file():
                 file.unlink()
     show_fit(fit.summary | {"seconds": seconds}, get_domain(recordings.domain).reach_unit)
-    print(f"{folder / 'posterior.nc'}: posterior and predictions, as ArviZ InferenceData")
+    what = "posterior and predictions, as ArviZ InferenceData"
+    print(f"{folder / POSTERIOR}: {what}{replaced}")
     print(f"{folder / 'summary.json'}: the numbers above")
     for name, shows in pictures.items():
         print(f"{folder / name}: {shows}")

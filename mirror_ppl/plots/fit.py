@@ -31,6 +31,10 @@ class FitPlots:
     def __init__(self, data: az.InferenceData) -> None:
         self.data = data
 
+    def __repr__(self) -> str:
+        names = [name for name in vars(FitPlots) if not name.startswith("_") and name != "files"]
+        return f"FitPlots({', '.join(names)})"
+
     def sight(self) -> Picture:
         """Draw what each person sees: the road, the house, or probabilities of noticing items.
 

@@ -77,6 +77,8 @@ from mirror_ppl.domains.driving.rewards import (
 from mirror_ppl.domains.world import World
 
 STAY, SWITCH = 0, 1
+ORANGE, PALE, DARK_BLUE = (230, 159, 0), (246, 221, 166), (0, 90, 160)
+"""Colours of cars, of cars that are not perceived, and of the person's, which is dark for greys."""
 FOG_REACH = 2
 """Number of cells ahead that a person sees in dense fog."""
 
@@ -113,6 +115,10 @@ class Driving(World):
     scenarios: tuple[str, ...] = tuple(SCENARIO_SPEEDS)
     reward_terms: tuple[str, ...] = ("proximity", "collision", "off_road", "lane_change")
     mishap: tuple[str, str] = ("collision", "collisions")
+    picture_legend = (
+        "Blue: the person, who drives to the right. Orange: cars that they see, or that are shown "
+        "or spoken of, at this step; pale: others"
+    )
     counterparts: tuple[int | None, ...] = (0, 1, 2, 3)
     directions: tuple[str, ...] = ("front_own", "front_other", "back_own", "back_other")
     direction_groups: tuple[tuple[int, ...], ...] = ((0, 1), (2, 3))
@@ -373,6 +379,13 @@ class Driving(World):
 
     def render(self, state: DrivingState) -> np.ndarray:
         """Draw ``uint8 [height, width, 3]`` of one state, the road running to the right."""
+        return self._road(state, torch.ones(len(CAR_LANES), dtype=torch.bool))
+
+    def render_seen(self, state: DrivingState, visible: Visibility) -> np.ndarray:
+        """Draw cars in pale colours that a person does not perceive, with ``visible`` ``[4]``."""
+        return self._road(state, torch.stack([*visible.values()]).any(0).flatten())
+
+    def _road(self, state: DrivingState, seen: Tensor) -> np.ndarray:
         cell, lanes, length = 16, 2, 2 * ROAD_END + 1
         picture = np.full((lanes * cell, length * cell, 3), 235, dtype=np.uint8)
         picture[cell - 1 : cell + 1, :: cell // 2] = 255
@@ -381,8 +394,9 @@ class Driving(World):
             left = (position + ROAD_END) * cell
             picture[lane * cell + 3 : (lane + 1) * cell - 3, left + 1 : left + cell - 1] = colour
 
-        for lane, position in zip(CAR_LANES, state.position.reshape(-1).tolist(), strict=True):
+        cars = zip(CAR_LANES, state.position.flatten().tolist(), seen.tolist(), strict=True)
+        for lane, position, clear in cars:
             if abs(position) < ROAD_END:
-                block(lane, position, (230, 159, 0))
-        block(int(state.lane), 0, (0, 90, 160))  # darker, so that grey tells them apart
+                block(lane, position, ORANGE if clear else PALE)
+        block(int(state.lane), 0, DARK_BLUE)
         return picture
