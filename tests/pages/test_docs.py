@@ -107,8 +107,9 @@ def test_python_of_the_communicator_runs(results, tmp_path, monkeypatch, capsys)
 def test_the_example_on_the_page_is_the_file():
     source = page("docs/examples/late_reactions.py")
     assert blocks(page("docs/extending.md"), "python")[0].strip() in source
-    source = page("docs/examples/distracted.py")
-    assert any(block.strip() in source for block in blocks(page("docs/extending.md"), "python"))
+    for name in ("distracted", "looks_away"):
+        source = page(f"docs/examples/{name}.py")
+        assert any(block.strip() in source for block in blocks(page("docs/extending.md"), "python"))
 
 
 def test_groups_and_variables_of_results_are_on_the_page(results):
