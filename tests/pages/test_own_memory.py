@@ -1,4 +1,4 @@
-"""The example with a memory of its own: what people see, and that fits and planners work with it."""
+"""The example with a memory of its own: what people see; fits and planners work with it."""
 
 from dataclasses import replace
 
