@@ -96,6 +96,9 @@ class Options:
     human_model: str | None = None
     """The human model that the posterior is of, if it is one of your own: path/to/file.py:Class,
     whose code is run."""
+    people_model: str | None = None
+    """The human model that the people were simulated with, if it is one of your own:
+    path/to/file.py:Class, whose code is run; as it was then."""
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
     population: str | None = None
@@ -232,6 +235,7 @@ def _pairing(
         setting=posterior.attributes["setting"],
         population=source["population"],
         people_seed=int(source["seed"]),
+        people_model=options.people_model,
         people=people,
         rounds=options.rounds,
         planner=planner,
@@ -324,13 +328,13 @@ def _contents(
 
 def _outputs(options: Options) -> list[Path]:
     from mirror_ppl.files import require_files_of_their_own
-    from mirror_ppl.models.variants import VARIANTS
+    from mirror_ppl.models.loading import file_of
 
-    source = None if options.human_model in VARIANTS else options.human_model
     inputs = {
         "--posterior": [options.posterior],
         "--self-model": [options.self_model],
-        "--human-model": [None if source is None else Path(source.rpartition(":")[0])],
+        "--human-model": [file_of(options.human_model)],
+        "--people-model": [file_of(options.people_model)],
     }
     return require_files_of_their_own(
         {"--json": options.json, "--log": options.log, "--film": options.film}, inputs
@@ -379,10 +383,14 @@ def _people(options: Options):
         raise PosteriorError(f"{options.posterior}: its people's seed is {source['seed']}")
     if not str(source["population"]).startswith(PRIOR_OF):
         require_known(source["population"], "population", populations_of(domain))
-    elif f"recorded_{OWN_HUMAN_MODEL}" in posterior.attributes:
+        if options.people_model is not None:
+            raise OptionError(
+                f"--people-model is for people of your own human model; those of "
+                f"{options.posterior} are of the population {source['population']}"
+            )
+    elif f"recorded_{OWN_HUMAN_MODEL}" in posterior.attributes and options.people_model is None:
         raise PosteriorError(
             f"{options.posterior}: is of people drawn from the {source['population']}, your own "
-            "human model, who cannot be played further; plan messages for them with "
-            "mirror_ppl.Communicator"
+            "human model; give it by --people-model path/to/file.py:Class"
         )
     return posterior, source

@@ -32,7 +32,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import file_of, load_human_model
 from mirror_ppl.models.simulation import PRIOR_OF
 from mirror_ppl.models.weights import SELF_MODEL, fingerprint, load_self_model, shipped_weights
-from mirror_ppl.people import SimulatedPeople, simulated_people
+from mirror_ppl.people import PeopleOfHumanModel, SimulatedPeople, simulated_people
 from mirror_ppl.randomness import number_of
 from mirror_ppl.version import __version__
 
@@ -56,6 +56,7 @@ class Pairing:
         planner: settings of the planners.
         seed: of the rounds and of everything random.
         keep_log: True to keep every decision.
+        people_model: human model from whose prior the people were drawn, if it is a user's.
     """
 
     posterior: Path
@@ -70,6 +71,7 @@ class Pairing:
     planner: PlannerOptions
     seed: int
     keep_log: bool
+    people_model: str | None = None
 
     @cached_property
     def file(self) -> PosteriorFile:
@@ -103,6 +105,7 @@ class Pairing:
             self._simulated,
             self.people_seed,
             self_model=self.self_model,
+            human_model=self.people_model,
         )
 
     @cached_property
@@ -138,7 +141,10 @@ class Pairing:
                 f"{self.posterior}: its people were simulated with another self-model "
                 f"({simulated}); simulate and fit them anew with this one"
             )
-        for site, value in self.everybody().truth().items():
+        everybody = self.everybody()
+        if isinstance(everybody, PeopleOfHumanModel) and self.people_model != self.human_model:
+            check_contract(everybody.human)
+        for site, value in everybody.truth().items():
             for person, number in self.numbers.items():
                 self._check_truth(person, site, float(value[number]))
 
@@ -197,7 +203,8 @@ class Pairing:
         digest = hashlib.sha256(json.dumps([settings, __version__], sort_keys=True).encode())
         digest.update(code_of(self.domain).encode())
         weights = self.self_model or shipped_weights(self.domain.name)
-        for path in (self.posterior, weights, file_of(self.human_model)):
+        models = map(file_of, (self.human_model, self.people_model))
+        for path in (self.posterior, weights, *models):
             digest.update(b"" if path is None else path.read_bytes())
         return digest.hexdigest()
 

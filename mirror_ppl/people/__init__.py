@@ -44,11 +44,13 @@ def simulated_people(
     seed: int,
     device: torch.device | str = "cpu",
     self_model: Path | None = None,
+    human_model: str | None = None,
 ) -> SimulatedPeople:
     """Return the simulated people of a population, to be stepped by the caller.
 
     A seed gives the people that `simulate` records with it; see there for arguments. The population
-    may also be the prior of one of the package's human models, as recordings name it.
+    may also be the prior of a human model, as recordings name it: of the package, or that of
+    ``human_model``, ``path/to/file.py:Class``.
 
     Raises:
         UnknownNameError: there is no such domain, setting or population.
@@ -57,7 +59,7 @@ def simulated_people(
         HumanModelError: people of the human model cannot be played step by step.
     """
     world = get_domain(domain)
-    model = _model_of(world, population)
+    model = _model_of(world, population, human_model)
     if model is None:
         require_known(population, "population", populations_of(domain), domain)
     people, seed = whole_number(people, "people", 1), seed_number(seed)
@@ -70,15 +72,23 @@ def simulated_people(
     return simulated_robot_like(robot.to(device), setting, population, people, seed)
 
 
-def _model_of(world: Domain, population: str) -> str | None:
-    """Name of the human model whose prior a population is; None if it is of another kind."""
+def _model_of(world: Domain, population: str, own: str | None) -> str | None:
+    """The human model whose prior a population is; None if it is of another kind."""
     if not population.startswith(PRIOR_OF):
+        if own is not None:
+            raise InputError(f"people of {population} are not drawn from a human model's prior")
         return None
-    model = model_name(population.removeprefix(PRIOR_OF))
+    drawn_from = population.removeprefix(PRIOR_OF)
+    if own is not None:
+        if ":" not in own:
+            raise InputError(f'"{own}" is not of the form path/to/file.py:Class')
+        if (given := own.rpartition(":")[2]) != drawn_from:
+            raise InputError(f"these people are drawn from the prior of {drawn_from}, not {given}")
+        return own
+    model = model_name(drawn_from)
     if model not in human_models_of(world):
         raise InputError(
-            f"people of your own human model {model} cannot be played further; plan messages for "
-            "them with mirror_ppl.Communicator"
+            f"these people are of your own human model {model}, which has to be given to play them"
         )
     return model
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from paths import ROOT
 from running import command
 
 import mirror_ppl
@@ -147,6 +148,41 @@ def test_people_drawn_from_a_human_model_play_further_rounds(posterior_of, tmp_p
     capsys.readouterr()
 
 
+LOOKS_AWAY = f"{ROOT}/docs/examples/looks_away.py:LooksAway"
+
+
+def test_people_of_a_users_model_play_further_rounds(posterior_of, tmp_path, capsys):
+    """As the model has it that is given, whatever model the posterior is of."""
+    human = load_human_model(LOOKS_AWAY, load_self_model(shipped_weights("driving"))[0])
+    recorded = simulate_from_prior(human, 3, 2, "fog", seed=4)
+    path, given = posterior_of(recorded), ("--people-model", LOOKS_AWAY)
+    expected = decisions(path, tmp_path, *given)
+    assert len({json.dumps(own) for own in expected.values()}) == 3
+    one = posterior_of(recorded.select_people(["person-03"]), human=human)
+    with_own = decisions(one, tmp_path, *given, "--human-model", LOOKS_AWAY)
+    assert with_own == {"person-03": expected["person-03"]}
+    capsys.readouterr()
+
+
+def test_another_people_model_is_refused(some, posterior_of, tmp_path, capsys):
+    human = load_human_model(LOOKS_AWAY, load_self_model(shipped_weights("driving"))[0])
+    recorded = simulate_from_prior(human, 1, 1, "fog", seed=4)
+    blur = {"blur": (recorded.truth["blur"] + 1) % 4}
+    other = f"{ROOT}/docs/examples/late_reactions.py:LatePerson"
+    of_package = simulate_from_prior(family.Late(human.self_model), 1, 1, "fog", seed=4)
+    for people, model, message in (
+        (recorded, other, "are drawn from the prior of LooksAway, not LatePerson"),
+        (recorded, "late", '"late" is not of the form path/to/file.py:Class'),
+        (replace(recorded, truth=recorded.truth | blur), LOOKS_AWAY, "by another version of"),
+        (some, LOOKS_AWAY, "--people-model is for people of your own human model; those of"),
+        (of_package, LOOKS_AWAY, "are drawn from the prior of Late, not LooksAway"),
+    ):
+        arguments = ("--posterior", posterior_of(people), *SMALL, "--people-model", model)
+        assert command(assist, *arguments, "--communicator", "none") == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and message in error
+
+
 def test_people_of_another_self_model_or_of_a_user_s_model_are_refused(
     posterior_of, tmp_path, capsys
 ):
@@ -159,7 +195,7 @@ def test_people_of_another_self_model_or_of_a_user_s_model_are_refused(
     shipped = simulate_from_prior(family.Late(robot), 1, 1, "fog", seed=4)
     for path, message in (
         (posterior_of(someone), "its people were simulated with another self-model"),
-        (posterior_of(own), "drawn from the prior of Late, your own human model, who cannot be"),
+        (posterior_of(own), "drawn from the prior of Late, your own human model; give it by --peo"),
         (posterior_of(shipped, human=Late(robot)), "is of your own human model Late; give it as"),
     ):
         assert command(assist, "--posterior", path, *SMALL, "--communicator", "none") == 2

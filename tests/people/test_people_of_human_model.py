@@ -78,7 +78,9 @@ def test_a_population_may_be_the_prior_of_a_human_model():
             simulate("driving", "fog", population, 2, 1)
     with pytest.raises(UnknownNameError, match='unknown setting "rain"'):
         simulated_people("driving", "rain", "prior of Late", 2, 3)
-    with pytest.raises(InputError, match="people of your own human model Mine cannot be played"):
+    with pytest.raises(
+        InputError, match="people are of your own human model Mine, which has to be given"
+    ):
         simulated_people("driving", "fog", "prior of Mine", 2, 3)
     with pytest.raises(HumanModelError, match="has round_latents, which are drawn anew in each"):
         simulated_people("bomb_defusal", "unlabelled", "prior of BombDefusalHuman", 2, 3)
