@@ -231,6 +231,7 @@ def known(human, people, reach_bin):
     }
 
 
+@pytest.mark.filterwarnings("ignore::mirror_ppl.errors.UnreadSite")
 @torch.no_grad()
 def test_a_late_person_is_distinguished_from_a_prompt_one(self_model, generator):
     late_person = type(load_human_model(f"{ROOT}/{EXAMPLE}", self_model))
