@@ -78,6 +78,10 @@ class HumanModelError(MirrorError):
     """
 
 
+class RuledOutError(HumanModelError):
+    """Raised if a human model rules out all draws of a person's implants."""
+
+
 class UnknownNameError(MirrorError):
     """Raised for a name, of a domain, a setting, an item and so on, that is not a known one."""
 
@@ -162,7 +166,7 @@ class MisspeltMember(MirrorWarning):
 
 
 class UnreadSite(MirrorWarning):
-    """Warns that no method of a user's human model reads some sites that its prior samples."""
+    """Warns that nothing in a user's human model seems to depend on some sites of its prior."""
 
 
 class UnexplainedPerson(MirrorWarning):

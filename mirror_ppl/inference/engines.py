@@ -23,7 +23,7 @@ from torch import Tensor
 from mirror_ppl.checks import as_path, real_number, require_kind, seed_number, whole_number
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.contradictions import check_world
-from mirror_ppl.errors import HumanModelError, InputError, UnknownNameError
+from mirror_ppl.errors import InputError, RuledOutError, UnknownNameError
 from mirror_ppl.inference import amortized, automatic, importance, nuts, svi
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, require_network_of
 from mirror_ppl.inference.engine import Engine, Inferred, Job, narrowed, widened
@@ -287,9 +287,9 @@ def _infer_person(engine: Engine, job: Job) -> dict[str, Any]:
     with clocked() as seconds, stage("infer"):
         try:
             found = engine.run(job)
-        except HumanModelError as error:
+        except RuledOutError as error:
             (person,) = job.rounds.people
-            raise HumanModelError(f"{person}: {error}") from error
+            raise RuledOutError(f"{person}: {error}") from error
     return {
         "draws": narrowed(found.draws),
         **{name: getattr(found, name) for name in WEIGHED},

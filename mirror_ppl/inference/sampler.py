@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from mirror_ppl.errors import HumanModelError
+from mirror_ppl.errors import RuledOutError
 from mirror_ppl.inference.pareto import pareto_smoothed
 from mirror_ppl.inference.residual_proposal import SITE, ResidualProposal
 from mirror_ppl.inference.weighted import Weighted
@@ -165,16 +165,15 @@ class Sampler:
         """Drop combinations that are behind the best by more than ``margin`` nats under every draw.
 
         Draws have to be from the prior. None is dropped if the program adds factors or observed
-        sites under which too few of the draws are effective, or if one is impossible under some
-        draws and possible under others.
+        sites under which too few of the draws are effective. Those are kept that are impossible
+        under a draw, as under others they may be the most probable.
         """
         joint, said = torch.cat(self._joints), torch.cat(self._corrections)
-        impossible = joint.isneginf()
-        if bool((impossible.any(0) & ~impossible.all(0)).any()):
-            return
         if float(said.max() - said.min()) > 0 and effective(said) < min(ENOUGH, len(said) / 2):
             return
-        keep = within(self.human, joint + said[:, None], margin)
+        keep = within(self.human, joint + said[:, None], margin) | joint.isneginf().any(0)
+        if self.combinations.fixed:
+            keep &= self.combinations.log_prior.isfinite()
         self.combinations = self.combinations.kept(keep)
         self._joints = [joint[:, keep] for joint in self._joints]
         if self.table.real.any():
@@ -320,7 +319,7 @@ class Sampler:
         target = joint.logsumexp(-1) + of_scalars + of_discrete + prior
         target = target + torch.cat(self._corrections)
         if bool((target == -math.inf).all()):
-            raise HumanModelError(
+            raise RuledOutError(
                 "the recorded actions have probability 0 under all draws of the implants: act() "
                 "has to give every recorded action some probability, as lapses do"
                 if bool((joint == -math.inf).all())

@@ -229,8 +229,9 @@ def _prune(compiled: ViewTables, guide: Callable[[], Draws], margin: float) -> N
 
     Each is scored under its best draw of the guide.
     """
-    human, table, best = compiled.human, compiled.table, None
+    human, table = compiled.human, compiled.table
     grid = combination_values(human, table)
+    best, spared = torch.tensor(-torch.inf), torch.tensor(False)
     for _ in range(PRUNING_DRAWS):
         drawn = guide()
         one = {name: value[None] for name, value in drawn.items()}
@@ -244,10 +245,11 @@ def _prune(compiled: ViewTables, guide: Callable[[], Draws], margin: float) -> N
             pyro.plate("person", table.people, dim=-PLATES),
         ):
             likelihoods = log_likelihoods(human, human.prior(), table)
-        score = combination_scores(table, likelihoods) + prior[0]
-        best = score if best is None else torch.maximum(best, score)
-    assert best is not None
-    compiled.restrict(best >= best.amax(-1, keepdim=True) - margin)
+        score = combination_scores(table, likelihoods)
+        # Under other draws, what is impossible here may be the most probable.
+        spared = score.isneginf() & prior[0].isfinite() | spared
+        best = torch.maximum(best, score + prior[0])
+    compiled.restrict((best >= best.amax(-1, keepdim=True) - margin) | spared)
 
 
 def _save(

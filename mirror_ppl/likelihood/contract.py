@@ -28,7 +28,7 @@ from mirror_ppl.likelihood.densities import PLATES, check_plates, log_prob, samp
 from mirror_ppl.likelihood.span_contract import check_spans_hold
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel, Implants, has_own_program, overrides
-from mirror_ppl.models.implants import sight_sites
+from mirror_ppl.models.implants import SIGHT
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
 from mirror_ppl.models.view import View
 from mirror_ppl.randomness import forked, seed_everything
@@ -98,7 +98,7 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
             _check_sites(trace.trace, people)
             _check_sight(domain, trace.trace)
             method = "round_latents"
-            latents = _round_latents(human, _Returned("round_latents", implants), people)
+            latents = _round_latents(human, _Returned(implants), people)
             for name in set(latents) & set(latent_sites(trace.trace)):
                 raise HumanModelError(f'"{name}" is a site of prior() and of round_latents()')
             sampled = latent_values(trace.trace)
@@ -110,7 +110,7 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
             belief = next(human.parameters()).new_zeros(people, human.belief_size)
             method = "nothing_known"
             knowledge: Any = human.nothing_known(people, device=device)
-            _check_knowledge("nothing_known returned {}", knowledge, people)
+            _check_knowledge("nothing_known returned {}", knowledge, (people,))
             for step, now in enumerate(observed):
                 with WithoutSites(BELIEVING):
                     readable = Readable(discrete | latents, implants.keys())
@@ -121,7 +121,7 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                     view, knowledge = _perceived(
                         human.perceive(readable, knowledge, now, told, step)
                     )
-                    _check_knowledge("perceive returned {} as knowledge", knowledge, people)
+                    _check_knowledge("perceive returned {} as knowledge", knowledge, (1, people))
                     method = "evidence"
                     evidence = human.evidence(view, now)
                     method = "believe"
@@ -135,7 +135,7 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                     )
                 _check_dtype(human, "believe", belief)
                 method = "act"
-                _check_act(human, _Returned("act", implants), belief)
+                _check_act(human, _Returned(implants), belief)
         _refuse_parameters(trace.trace)
         _check_names(domain, [*latent_sites(trace.trace), *latents])
         method = "spans"
@@ -151,30 +151,30 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
     except (Exception, SystemExit) as error:
         file = getattr(sys.modules.get(type(human).__module__), "__file__", None)
         where = describe(error, None if file is None else Path(file))
+        if isinstance(error, NotReturned):
+            where += "; prior() does not return that: start from super().prior()"
+            where += " (of covariates, use .get)" if method == "round_latents" else ""
         raise HumanModelError(f"{type(human).__name__}.{method} fails: {where}") from error
     if unused:
         names = ", ".join(f'"{name}"' for name in unused)
         warnings.warn(
-            f"no method of {type(human).__name__} reads {names}, so that the posterior is the "
-            "prior: return each site from prior() by its name, and read it in perceive, sees or "
-            "act, or leave it out",
+            f"nothing in {type(human).__name__} was found to depend on {names}, so that the "
+            "posterior is the prior: return each site from prior() by its name, and read it in "
+            "perceive, sees or act, or leave it out",
             UnreadSite,
             stacklevel=4,  # of no_grad, too
         )
 
 
-class _Returned(dict[str, Tensor]):
-    """What ``prior`` returned, for another method, which may read something else."""
+class NotReturned(KeyError):
+    """Raised where a method reads something that ``prior`` did not return."""
 
-    def __init__(self, method: str, implants: Implants) -> None:
-        super().__init__(implants)
-        self.method = method
+
+class _Returned(dict[str, Tensor]):
+    """What ``prior`` returned, for another method."""
 
     def __missing__(self, name: str) -> Tensor:
-        raise HumanModelError(
-            f'{self.method} reads "{name}", which prior() does not return; start from '
-            "super().prior()"
-        )
+        raise NotReturned(name)
 
 
 def _perceived(found: Any) -> tuple[View, Any]:
@@ -190,16 +190,23 @@ def _perceived(found: Any) -> tuple[View, Any]:
     )
 
 
-def _check_knowledge(what: str, knowledge: Any, people: int) -> None:
-    """Check that knowledge is a dataclass, as its tensors are selected by people."""
+def _check_knowledge(what: str, knowledge: Any, numbers: tuple[int, ...]) -> None:
+    """Check that knowledge is a dataclass, as its tensors are selected by people.
+
+    Their first dimension is one of the ``numbers``, of which the last is that of people.
+    """
     if not is_dataclass(knowledge):
         found = what.format(type(knowledge).__name__)
         raise HumanModelError(f"{found}, expected a dataclass of tensors")
     for field in fields(knowledge):
         part = getattr(knowledge, field.name)
-        if torch.is_tensor(part) and part.shape[:1] != (people,):
+        if is_dataclass(part):
+            _check_knowledge(what, part, numbers)
+        elif torch.is_tensor(part) and (part.dim() == 0 or len(part) not in numbers):
             found = what.format(f"{field.name} of shape {tuple(part.shape)}")
-            raise HumanModelError(f"{found}, expected ({people}, ...) for {people} people")
+            raise HumanModelError(
+                f"{found}, expected ({numbers[-1]}, ...) for {numbers[-1]} people"
+            )
 
 
 def _check_sees(domain: Domain, masks: Any, people: int) -> None:
@@ -380,13 +387,14 @@ def _check_sites(trace: poutine.Trace, people: int) -> None:
 
 def _check_sight(domain: Domain, trace: poutine.Trace) -> None:
     """Refuse thresholds of sight with more values than there are bins."""
-    latent, bins = latent_sites(trace), len(domain.reach_bins)
-    for name in sight_sites(domain):
-        if name in latent and latent[name]["fn"].has_enumerate_support:
-            values = len(latent[name]["fn"].enumerate_support(expand=False))
+    bins = len(domain.reach_bins)
+    for name, site in latent_sites(trace).items():
+        if name.startswith(SIGHT) and site["fn"].has_enumerate_support and not site["fn"].event_dim:
+            values = len(site["fn"].enumerate_support(expand=False))
             if values > bins:
                 raise HumanModelError(
-                    f'"{name}" has {values} values, but {domain.name} has {bins} reach_bins'
+                    f'"{name}" has {values} values, but {domain.name} has {bins} reach_bins; a '
+                    f'site that is no threshold needs a name without "{SIGHT}"'
                 )
 
 

@@ -26,6 +26,8 @@ from mirror_ppl.randomness import forked
 
 CHUNK = 2**19
 """Views and moments, summed over draws, that are computed at once: what a cache holds."""
+IMPROBABLE = -1e4
+"""Log-probability that stands for 0 where gradients are taken."""
 
 
 def combination_values(human: HumanModel, table: ViewTable) -> dict[str, Tensor]:
@@ -113,7 +115,9 @@ def expected_counts(
         implants = human.prior()
         with torch.no_grad():
             _, moments = choices(human, implants, table.belief, table.values, table.acted)
-        moments = moments.expand(number, *moments.shape[-2:]).clone().requires_grad_()
+        moments = moments.expand(number, *moments.shape[-2:])
+        # Sums of which all terms are impossible have no gradient.
+        moments = moments.clamp(min=IMPROBABLE).clone().requires_grad_()
         likelihoods = of_moments(human, implants, table, moments)
         joint = combination_scores(table, likelihoods, combinations)[:, 0]
         if log_prior is None:

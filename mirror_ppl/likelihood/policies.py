@@ -100,7 +100,7 @@ def within(human: HumanModel, log_joint: Tensor, margin: float) -> Tensor:
     """
     if dependencies(human).adds_to_actions:
         # Recordings besides actions may be of a person whom no policy resembles.
-        log_joint = log_joint - log_joint.amax(-1, keepdim=True)
+        log_joint = (log_joint - log_joint.amax(-1, keepdim=True)).nan_to_num(-torch.inf)
     best = log_joint.amax(0)
     return best >= best.max() - margin
 

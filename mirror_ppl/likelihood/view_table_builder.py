@@ -2,8 +2,8 @@
 
 Every combination of the discrete implants is a candidate. After some rounds, candidates are dropped
 whose likelihood is far below the best one's under every policy. Later rounds need no views of them,
-and exact marginalization stays cheap. From the first round on that is impossible under a policy and
-candidate, none is dropped.
+and exact marginalization stays cheap. A candidate is kept if recorded actions are impossible under it
+and some policy: with other policies it may be the most probable one.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from mirror_ppl.likelihood.attention import KEPT, VALUES, AttentionValues, Proposal
-from mirror_ppl.likelihood.chain import Chain
+from mirror_ppl.likelihood.chain import NEVER, Chain
 from mirror_ppl.likelihood.chained_views import chained_views
 from mirror_ppl.likelihood.combination_sets import fixed_prior
 from mirror_ppl.likelihood.combinations import (
@@ -205,9 +205,7 @@ class ViewTableBuilder:
         if self.screening is not None and self.screening.resolution > 0:
             views, place = self._merged(views, self.screening)
             which = place[which]
-        found = (
-            None if self.screening is None else self._possible(self._likelihoods.of_views(views))
-        )
+        found = None if self.screening is None else self._likelihoods.of_views(views)
         total = torch.zeros(len(self.score), len(alive), device=alive.device)
         for one, (own, part), seen in zip(
             rounds.each(), views.split(), which.view(len(rounds), number), strict=True
@@ -221,7 +219,7 @@ class ViewTableBuilder:
                 likelihoods = found[:, own]
                 if attended is not None and sights is not None:
                     joint = self._likelihoods.with_attention(likelihoods[:, sights], attended)
-                    useful = torch.softmax(joint, -1).mean(1)
+                    useful = torch.softmax(joint, -1).nan_to_num(0.0).mean(1)
                     likelihoods = torch.logsumexp(joint, -1)
                     attended = attended.thinned(self._weights() @ useful, KEPT, seed)
                     sights = sights[:, attended.kept]
@@ -270,16 +268,15 @@ class ViewTableBuilder:
         every = torch.arange(len(alive), device=alive.device)
         for one, chain, (_, part) in zip(rounds.each(), chains, parts, strict=True):
             self._take(one, replace(part, chain=chain), every, alive)
-        found = (
-            None if self.screening is None else self._possible(self._likelihoods.of_views(views))
-        )
-        if found is not None and self.screening is not None:
+        if self.screening is not None:
+            likelihoods = self._likelihoods.of_views(views)[:, None]
             together = Chain.one_after_another(chains, [len(part.moments) for _, part in parts])
             with self._likelihoods.conditioned():
                 probabilities = together.log_probabilities(
                     self.human, self.human.prior(), len(rounds)
                 )
-            found = together.marginal(found[:, None], probabilities)[:, 0]
+            found = together.marginal(likelihoods, probabilities)[:, 0]
+            found = found.masked_fill(found <= NEVER, -torch.inf)
             self._screen(found.unflatten(-1, (len(rounds), -1)).sum(1), self.screening)
 
     def _take(self, one: Rounds, part: RoundViews, seen: Tensor, alive: Tensor) -> None:
@@ -287,16 +284,6 @@ class ViewTableBuilder:
         self._rounds.append(part)
         self._seen.append((alive, seen))
         self._recorded.append((one.actions[0], one.real[0]))
-
-    def _possible(self, found: Tensor) -> Tensor | None:
-        """Return log-likelihoods if none is minus infinity; else no candidate is dropped any more.
-
-        Under other policies than these, what is impossible here may be the most probable.
-        """
-        if bool(found.isneginf().any()):
-            self.screening = None
-            return None
-        return found
 
     def _screen(self, found: Tensor, screening: Screening) -> None:
         """Add log-likelihoods ``[policies, M']`` of those alive; drop those far behind."""
@@ -306,7 +293,8 @@ class ViewTableBuilder:
         # With the prior, whose factors and observed sites may rule combinations out.
         joint = score + self.log_prior[:, alive]
         margin = screening.margin_after(len(self._rounds))
-        self.alive = alive[within(self.human, joint, margin)]
+        spared = score.isneginf().any(0) & self.log_prior[:, alive].isfinite().any(0)
+        self.alive = alive[within(self.human, joint, margin) | spared]
 
     def table(self) -> ViewTable:
         """Build the table of the views that are left; needs at least one round."""
@@ -356,6 +344,8 @@ class ViewTableBuilder:
             number = PROPOSING_POLICIES
             return torch.full((number,), 1 / number, device=self.alive.device)
         joint = (self.score + self.log_prior)[:, self.alive].logsumexp(-1)
+        if not bool(joint.isfinite().any()):
+            joint = torch.zeros_like(joint)
         # Tempered: else few policies, none of them the person, would have all the weight.
         return torch.softmax(joint / TEMPERATURE, 0)
 

@@ -93,5 +93,5 @@ def _draw(ax: Axes, rows: dict[str, np.ndarray], items: list[str], first: bool) 
 
 
 NOTICES_PICTURE = SightPicture(
-    has_notices, notices_picture, "how probably each person notices what is there"
+    has_notices, notices_picture, "how probably each person notices what is there", False
 )

@@ -84,11 +84,13 @@ class SightPicture:
         possible: returns True if a posterior can be drawn this way.
         draw: draws it.
         shows: description in words.
+        thresholds: True if it shows what is within the thresholds of sight.
     """
 
     possible: Callable[[az.InferenceData], bool]
     draw: Callable[[az.InferenceData], Picture]
     shows: str
+    thresholds: bool = True
 
 
 def displayable(text: str, font: font_manager.FontProperties | None = None) -> str:

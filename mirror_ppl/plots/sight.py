@@ -34,9 +34,9 @@ def sight_pictures(data: az.InferenceData) -> dict[str, SightPicture]:
 def drawn(picture: SightPicture, data: az.InferenceData) -> Picture:
     """Draw a picture of sight; its title says so if a user's human model has its own sight."""
     figure, attributes = picture.draw(data), data["posterior"].attrs
-    if method := attributes.get(OWN_SIGHT):
+    if picture.thresholds and (method := attributes.get(OWN_SIGHT)):
         own = f"{attributes['human_model']}.{method}()"
-        lines = (figure.get_suptitle(), f"Thresholds alone: {own} decides what people see")
+        lines = (figure.get_suptitle(), f"Thresholds alone: {own} may change what people see")
         figure.suptitle("\n".join(lines), **TITLE)
     return figure
 

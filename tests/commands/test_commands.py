@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import warnings
 from dataclasses import dataclass
 
 import pytest
@@ -15,7 +16,7 @@ import torch
 import mirror_ppl
 from mirror_ppl import errors
 from mirror_ppl.commands import COMMANDS
-from mirror_ppl.console import run
+from mirror_ppl.console import guarded, run
 from mirror_ppl.errors import MirrorError, UnknownNameError
 from mirror_ppl.progress import Progress, Stages
 
@@ -112,6 +113,20 @@ class Options:
 
 def start(main, *args):
     return run(Options, main, prog="toy", description="A toy.", args=args)
+
+
+def test_warnings_of_the_package_are_lines_without_a_place():
+    """Those of others are as ever; so are all after the command."""
+    ours, others = (errors.MisspeltMember, "two\nlines \x1b"), (UserWarning, "theirs")
+    usual = [warnings.formatwarning(text, kind, "a.py", 3) for kind, text in (ours, others)]
+
+    def call():
+        said = [warnings.formatwarning(text, kind, "a.py", 3) for kind, text in (ours, others)]
+        assert said == ["warning: two lines \\x1b\n", usual[1]]
+        return 0
+
+    assert guarded(call) == 0
+    assert warnings.formatwarning(ours[1], ours[0], "a.py", 3) == usual[0]
 
 
 def test_run_passes_the_options_and_returns_the_status(capsys):

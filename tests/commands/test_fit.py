@@ -110,10 +110,12 @@ def test_posterior_opens_without_this_package_and_agrees_with_the_summary(folder
 def test_one_seed_gives_one_summary(folder, quick):
     torch.manual_seed(99)
     args = NOTHING_HELD_OUT
-    assert command(fit, *short_fit(folder, "again", *args)) == 0
+    said, _ = said_by(*short_fit(folder, "again", *args))
     assert summary_of(folder / "again") == summary_of(quick[0])
-    assert command(fit, *short_fit(folder, "other", *args), "--seed", 1) == 0
-    other = summary_of(folder / "other")
+    assert "replaces" not in said
+    said, _ = said_by(*short_fit(folder, "again", *args), "--seed", 1)
+    assert "InferenceData; it replaces an earlier one" in said
+    other = summary_of(folder / "again")
     assert other.pop("seed") == 1
     assert other["people"] != summary_of(quick[0])["people"]
 

@@ -2,6 +2,7 @@
 
 import itertools
 
+import numpy as np
 import pytest
 import torch
 from example_driving import STAY, SWITCH, rollout, same, state
@@ -225,3 +226,18 @@ def test_names_are_checked(domain):
     assert domain.reward_terms == TERMS
     with pytest.raises(ValueError, match="needs a unit and a scale"):
         Modality("visual", ("car",), ("distance",), ("cells", "lanes"), (1.0,), 0.0)
+
+
+def test_what_a_person_does_not_perceive_is_pale():
+    """A car counts as perceived by eye or by ear."""
+    seen = {"visual": torch.tensor([True, False, False, False])}
+    seen["verbal"] = torch.tensor([False, False, True, False])
+    now = state(0, (3, 2, -4, -9))
+    whole, part = Driving().render(now), Driving().render_seen(now, seen)
+    changed = (whole != part).any(-1)
+    expected = np.zeros_like(changed)
+    for ahead in (2, -9):  # of the cars in lane 1
+        left = (ahead + 12) * 16
+        expected[19:29, left + 1 : left + 15] = True
+    assert np.array_equal(changed, expected)
+    assert {tuple(colour) for colour in part[changed].tolist()} == {(246, 221, 166)}

@@ -261,7 +261,7 @@ class Wrong(PerItem):
         ("param", '"p" is a pyro.param; sample it'),
         ("clash", r'"lapse" is a site of prior\(\) and of round_latents\(\)'),
         ("event", r'"m" of round_latents has shape \(1,\) and event shape \(3,\), expected'),
-        ("raises", r'round_latents reads "nothing", which prior\(\) does not return; start from'),
+        ("raises", r"Wrong.round_latents fails: NotReturned: 'nothing' \(test_attention.py, line"),
     ],
 )
 def test_what_cannot_be_attended_to_is_refused(self_model, kind, message):

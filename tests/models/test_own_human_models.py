@@ -244,17 +244,17 @@ def test_what_is_not_a_human_model_is_refused(tmp_path, monkeypatch, human, spec
         (
             "act(self, implants, belief, values)",
             'return implants["mood"]',
-            r'act reads "mood", which prior\(\) does not return; start from super\(\)\.prior\(\)',
+            r"act fails: NotReturned: 'mood' \(mine\.py, line 9\); prior\(\) does not return that",
         ),
         (
             "prior(self)",
             'kept = super().prior(); del kept["lapse"]; return kept',
-            'act reads "lapse", which prior',
+            r"Mine\.act fails: NotReturned: 'lapse' .*; prior\(\) does not return that",
         ),
         (
             "round_latents(self, implants)",
             'return {"mood": implants["mood"]}',
-            'round_latents reads "mood", which prior',
+            r"round_latents fails: NotReturned: 'mood' .*prior\(\) \(of covariates, use \.get\)$",
         ),
         (
             "prior(self)",
@@ -271,6 +271,12 @@ def test_what_is_not_a_human_model_is_refused(tmp_path, monkeypatch, human, spec
             'name = "sight_front_own"; hidden = pyro.poutine.block(super().prior, hide=[name])(); '
             "return hidden | {name: pyro.sample(name, dist.Categorical(torch.ones(9)))}",
             '"sight_front_own" has 9 values, but driving has 7 reach_bins',
+        ),
+        (
+            "prior(self)",
+            'name = "sight_radius"; own = pyro.sample(name, dist.Categorical(torch.ones(9))); '
+            "return super().prior() | {name: own}",
+            '"sight_radius" has 9 values, .*; a site that is no threshold needs a name without',
         ),
         (
             "nothing_known(self, *batch, device=None)",
@@ -348,9 +354,31 @@ def test_a_site_that_nothing_reads_is_named(tmp_path, human, returned, used, sai
         warnings.simplefilter("always")
         check_contract(mine)
     names = ", ".join(f'"{name}"' for name in said)
-    expected = [f"no method of Mine reads {names}, so that the posterior is the prior"]
+    expected = [
+        f"nothing in Mine was found to depend on {names}, so that the posterior is the prior"
+    ]
     assert [str(one.message).partition(":")[0] for one in told] == expected[: len(said)]
     assert all(one.category is UnreadSite for one in told)
+
+
+def test_memory_may_be_the_same_for_all_people(tmp_path, human):
+    code = """
+        class Timed(HumanModel):
+            def nothing_known(self, *batch, device=None):
+                return Timer(super().nothing_known(*batch, device=device), torch.zeros(*batch, 1))
+
+            def perceive(self, implants, knowledge, observation, told, step):
+                view, cars = super().perceive(implants, knowledge.cars, observation, told, step)
+                return view, Timer(cars, torch.full((1, 1), float(step)))
+
+        import dataclasses
+
+        @dataclasses.dataclass
+        class Timer:
+            cars: object
+            time: torch.Tensor
+        """
+    check_contract(user_model(tmp_path, human, code, "Timed"))
 
 
 def test_a_misspelt_method_is_named(tmp_path, human):

@@ -53,6 +53,9 @@ def test_fits_and_planners_work_with_a_number_for_each_person():
         explore=0,
     )
     assert "blur" in fit.person("person-02").implants.index
+    for picture in (fit.plot.sight(), fit.plot.samples()):
+        note = "Thresholds alone: LooksAway.perceive() may change what people see"
+        assert picture.get_suptitle().split("\n")[1] == note
     planner = mirror_ppl.Communicator(fit, "person-02", draws=16)
     observed = {name: value[0, 0, 0] for name, value in rounds.observation().items()}
     silence = {name: mask[0, 0, 0] & False for name, mask in rounds.told.items()}
