@@ -2,8 +2,8 @@
 
 Every combination of the discrete implants is a candidate. After some rounds, candidates are dropped
 whose likelihood is far below the best one's under every policy. Later rounds need no views of them,
-and exact marginalization stays cheap. A candidate is kept if recorded actions are impossible under it
-and some policy: with other policies it may be the most probable one.
+and exact marginalization stays cheap. A candidate is kept if recorded actions are impossible under
+it and some policy: with other policies it may be the most probable one.
 """
 
 from __future__ import annotations

@@ -12,10 +12,13 @@ from mirror_ppl.domains.bomb_defusal.human_variants import BombDefusalNoImplants
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate
 from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.inference.sampler import Sampler
 from mirror_ppl.inference.svi import SVIOptions
 from mirror_ppl.likelihood.compiled import compile
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.screening import Screening
+from mirror_ppl.likelihood.tables import rounds_of
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import has_own_program
@@ -237,6 +240,22 @@ def test_what_recorded_actions_rule_out_under_some_policies_is_kept(self_model):
     plain = infer(human, rounds, InferenceOptions("importance", 50, screening=None), 0)
     # The same draws; steps are merged on a grid of .03 nats.
     torch.testing.assert_close(found.log_evidence, plain.log_evidence, rtol=0, atol=0.01)
+
+
+def test_what_is_impossible_under_some_policies_is_not_dropped(self_model):
+    human = Strict(self_model)
+    rounds = load_recordings().select_people([0]).select_rounds([0, 1])
+    builder = ViewTableBuilder(human, Screening(margin=1, early=0))
+    builder.add(rounds_of(rounds, 0))
+    impossible = builder.score.isneginf().any(0).nonzero().flatten()
+    assert 0 < len(impossible) and len(builder.alive) < builder.score.shape[1]
+    assert torch.isin(impossible, builder.alive).all()
+    sampler = Sampler(human, builder.table())
+    sampler.draw(64)
+    before = sampler.weighted().log_joint.isneginf().any(0)
+    sampler.prune(1.0)
+    after = sampler.weighted().log_joint.isneginf().any(0)
+    assert len(after) < len(before) and 0 < before.sum() == after.sum()
 
 
 class StrictItems(Strict, PerItem):
