@@ -248,7 +248,7 @@ def test_what_is_impossible_under_some_policies_is_not_dropped(self_model):
     builder = ViewTableBuilder(human, Screening(margin=1, early=0))
     builder.add(rounds_of(rounds, 0))
     impossible = builder.score.isneginf().any(0).nonzero().flatten()
-    assert 0 < len(impossible) and len(builder.alive) < builder.score.shape[1]
+    assert len(impossible) > 0 and len(builder.alive) < builder.score.shape[1]
     assert torch.isin(impossible, builder.alive).all()
     sampler = Sampler(human, builder.table())
     sampler.draw(64)
