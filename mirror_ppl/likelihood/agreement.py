@@ -118,7 +118,8 @@ def _check_each_alone(human: HumanModel) -> None:
 def unused_sites(human: HumanModel) -> list[str]:
     """Sites of ``prior`` on which nothing else depends, so that their posterior is their prior.
 
-    Neither provenance nor different values show that something depends on them.
+    Neither provenance nor different values show that something depends on them. Sites that depend
+    on others are left out: these can be measured.
     """
     found = dependencies(human)
     used = frozenset(perceived_sites(human)).union(
@@ -131,7 +132,8 @@ def unused_sites(human: HumanModel) -> list[str]:
         other = _said_by_site(human, draws | {name: draws[name].roll(1, 0)}, COMPARED, 2)
         return any(not usual[key].equal(other[key]) for key in usual.keys() - {("prior", name)})
 
-    return [name for name in draws if name not in used and not matters(name)]
+    roots = [name for name in draws if name not in used and not found.prior[name]]
+    return [name for name in roots if not matters(name)]
 
 
 def _said_by_site(

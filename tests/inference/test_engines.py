@@ -85,6 +85,7 @@ def test_pruning_leaves_the_posterior_as_it_is(toy, recordings):
     assert torch.equal(kept, behind <= 0.5)
 
 
+@pytest.mark.filterwarnings("ignore::mirror_ppl.errors.UnreadSite")
 @pytest.mark.parametrize("guide", ["importance", "svi"])
 def test_models_with_little_to_infer(toy, recordings, guide):
     """Sight alone, and an implant that actions do not depend on."""
