@@ -234,6 +234,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
         checkpoint: file to continue from; written on the way, and kept.
 
     Warns:
+        UnreadSite: nothing in a model of yours seems to depend on some sites of its prior.
         PriorConflict: the prior of a site is at odds with most of the people.
         UnreliableWeights: importance weights of a person are not reliable.
 

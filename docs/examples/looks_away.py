@@ -9,6 +9,7 @@ At the step after a switch, thresholds of sight are ``blur`` bins nearer::
 ``docs/extending.md`` explains how to write such a class.
 """
 
+from collections import ChainMap
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,9 +47,9 @@ class LooksAway(HumanModel):
         lane = observation["ego"][..., 0]
         switched = (knowledge.lane >= 0) & (lane != knowledge.lane)
         blur = torch.where(switched, implants["blur"], 0)
-        nearer = {
-            site: (implants[site] - blur).clamp(min=0) if site.startswith("sight_") else own
-            for site, own in implants.items()
-        }
-        view, cars = super().perceive(nearer, knowledge.cars, observation, told, step)
+        sites = [f"sight_{direction}" for direction in self.domain.directions]
+        nearer = {site: (implants[site] - blur).clamp(min=0) for site in sites}
+        # Not a copy of all implants, which would count as read.
+        now = ChainMap(nearer, implants)
+        view, cars = super().perceive(now, knowledge.cars, observation, told, step)
         return view, Memory(cars, lane)

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import pyro
-import pyro.distributions as dist
 import torch
 from pyro import poutine
-from pyro.distributions.torch_distribution import MaskedDistribution
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
-from torch.distributions import Independent, biject_to
 
 from mirror_ppl.checks import require_kind
 from mirror_ppl.domains import Domain
@@ -24,26 +21,21 @@ from mirror_ppl.domains.record import require_power
 from mirror_ppl.errors import HumanModelError, MirrorError, UnreadSite
 from mirror_ppl.likelihood.agreement import check_agreement, unused_sites
 from mirror_ppl.likelihood.combinations import forget
-from mirror_ppl.likelihood.densities import PLATES, check_plates, log_prob, sample_nodes
+from mirror_ppl.likelihood.site_contract import (
+    check_names,
+    check_sight,
+    check_sites,
+    refuse_parameters,
+    refuse_plates,
+)
 from mirror_ppl.likelihood.span_contract import check_spans_hold
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel, Implants, has_own_program, overrides
-from mirror_ppl.models.implants import SIGHT
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
 from mirror_ppl.models.view import View
 from mirror_ppl.randomness import forked, seed_everything
 from mirror_ppl.shapes import broadcast_shapes
 from mirror_ppl.user_code import describe, is_of_package
-
-AXES = (
-    *("chain", "draw", "person", "round", "test_round", "step", "time", "direction", "sample"),
-    *("action", "action_name", "action_probability", "action_entropy", "observed_action", "ego"),
-    *("ego_feature", "site", "scenario", "residual_input", "residual_unit"),
-    "residual_unit_and_bias",
-)
-"""Names of dimensions and other variables in posterior files."""
-PREFIXES = ("told_", "truth_", "measured_")
-"""Prefixes of variables of recordings, which sites must not have."""
 
 
 @torch.no_grad()
@@ -60,7 +52,7 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
         InputError: its power of the likelihood is none.
 
     Warns:
-        UnreadSite: no method reads some sites of the prior.
+        UnreadSite: nothing seems to depend on some sites of the prior.
     """
     require_kind(human, HumanModel, "human")
     domain = human.domain
@@ -95,8 +87,8 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                     f"prior returned {type(implants).__name__}, expected a dict of sites by name"
                 )
             _check_returned("prior", implants, latent_sites(trace.trace))
-            _check_sites(trace.trace, people)
-            _check_sight(domain, trace.trace)
+            check_sites(trace.trace, people)
+            check_sight(domain, trace.trace)
             method = "round_latents"
             latents = _round_latents(human, _Returned(implants), people)
             for name in set(latents) & set(latent_sites(trace.trace)):
@@ -136,8 +128,8 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                 _check_dtype(human, "believe", belief)
                 method = "act"
                 _check_act(human, _Returned(implants), belief)
-        _refuse_parameters(trace.trace)
-        _check_names(domain, [*latent_sites(trace.trace), *latents])
+        refuse_parameters(trace.trace)
+        check_names(domain, [*latent_sites(trace.trace), *latents])
         method = "spans"
         if human.chained:
             check_spans_hold(human, {name: value[:1] for name, value in discrete.items()})
@@ -254,8 +246,8 @@ def _check_act(human: HumanModel, implants: Implants, belief: Tensor) -> None:
             f'act samples "{name}" at every step; sample it in prior if it is one of a person, '
             "else sum it out in what act returns, by torch.logaddexp"
         )
-    _refuse_parameters(trace.trace)
-    _refuse_plates(trace.trace)
+    refuse_parameters(trace.trace)
+    refuse_plates(trace.trace)
     expected = (len(belief), 1, len(human.domain.actions))
     if not torch.is_tensor(found):
         raise HumanModelError(f"act returned {type(found).__name__}, expected log-probabilities")
@@ -288,8 +280,8 @@ def _round_latents(human: HumanModel, implants: Implants, people: int) -> dict[s
                 f'round_latents has "{name}", but no site that differs from round to round: put it '
                 "into prior"
             )
-    _refuse_parameters(trace.trace)
-    _refuse_plates(trace.trace)
+    refuse_parameters(trace.trace)
+    refuse_plates(trace.trace)
     for name, site in sites.items():
         if not site["fn"].support.is_discrete:
             raise HumanModelError(f'"{name}" of round_latents is not discrete')
@@ -304,40 +296,6 @@ def _round_latents(human: HumanModel, implants: Implants, people: int) -> dict[s
     return {name: site["value"].flatten()[:people].expand(people) for name, site in sites.items()}
 
 
-def _check_names(domain: Domain, sites: Iterable[str]) -> None:
-    """Refuse names of sites that are reserved or invalid in posterior files."""
-    taken = {*AXES, *(f"{m.name}_item" for m in domain.modalities)}
-    taken |= {part for m in domain.modalities for part in (m.name, f"{m.name}_feature")}
-    for name in sites:
-        if not name.isprintable() or name != name.strip() or set(name) & {"/"}:
-            raise HumanModelError(f'"{name}" cannot be the name of a site: use plain words')
-        if name in taken or name.startswith(PREFIXES):
-            raise HumanModelError(
-                f'"{name}" cannot be the name of a site: posterior files reserve it'
-            )
-
-
-def _refuse_parameters(trace: poutine.Trace) -> None:
-    for name, site in trace.nodes.items():
-        if site["type"] == "param":
-            raise HumanModelError(f'"{name}" is a pyro.param; sample it, so that it has a prior')
-
-
-def _refuse_plates(trace: poutine.Trace) -> None:
-    for name, site in sample_nodes(trace).items():
-        for frame in site["cond_indep_stack"]:
-            if frame.dim is None:
-                raise HumanModelError(
-                    f'"{name}" is in the sequential plate "{frame.name}"; give its distribution '
-                    ".to_event(1) in place of a plate"
-                )
-            if frame.dim < -PLATES:
-                raise HumanModelError(
-                    f'"{name}" is in the plate "{frame.name}" at dimension {frame.dim}, which '
-                    "draws of people take; give its distribution .to_event(1) in place of a plate"
-                )
-
-
 def _check_returned(method: str, returned: Mapping[str, Any], sites: Mapping[str, Any]) -> None:
     """Refuse returned values that differ from the sampled ones: engines read the sites."""
     for name in returned:
@@ -349,85 +307,3 @@ def _check_returned(method: str, returned: Mapping[str, Any], sites: Mapping[str
                     f'{method} returns other values of "{name}" than those that it sampled; sample '
                     "what it returns, or let the method that reads it change it"
                 )
-
-
-def _check_sites(trace: poutine.Trace, people: int) -> None:
-    """Refuse sites that can be sampled but not inferred."""
-    _refuse_parameters(trace)
-    _refuse_plates(trace)
-    for name, site in sample_nodes(trace).items():
-        if site["is_observed"]:
-            value = torch.as_tensor(site["value"])
-            if value.numel():  # factors are empty
-                check_plates(name, value[(..., *(0,) * site["fn"].event_dim)], people)
-            check_plates(name, log_prob(site), people)
-    latent = latent_sites(trace)
-    if not latent:
-        raise HumanModelError("prior samples no site, so there is nothing to infer")
-    for name, site in latent.items():
-        fn = site["fn"]
-        _refuse_distribution(name, fn)
-        if fn.support.is_discrete and not fn.has_enumerate_support:
-            raise HumanModelError(
-                f'"{name}" is discrete without finite support; it can be neither enumerated nor '
-                "approximated"
-            )
-        if tuple(fn.batch_shape) != (people, 1):
-            raise HumanModelError(
-                f'"{name}" has batch shape {tuple(fn.batch_shape)}, expected ({people}, 1) for '
-                f"{people} people; use .to_event() for several numbers a person"
-            )
-        bounds = [bound for bound in vars(fn.support).values() if torch.is_tensor(bound)]
-        if not fn.event_dim and any(bool((bound != bound.flatten()[0]).any()) for bound in bounds):
-            raise HumanModelError(
-                f'what "{name}" can be depends on another site; sample it from 0 to 1, say, and '
-                "stretch it where it is read"
-            )
-
-
-def _check_sight(domain: Domain, trace: poutine.Trace) -> None:
-    """Refuse thresholds of sight with more values than there are bins."""
-    bins = len(domain.reach_bins)
-    for name, site in latent_sites(trace).items():
-        if name.startswith(SIGHT) and site["fn"].has_enumerate_support and not site["fn"].event_dim:
-            values = len(site["fn"].enumerate_support(expand=False))
-            if values > bins:
-                raise HumanModelError(
-                    f'"{name}" has {values} values, but {domain.name} has {bins} reach_bins; a '
-                    f'site that is no threshold needs a name without "{SIGHT}"'
-                )
-
-
-def _refuse_distribution(name: str, fn: Any) -> None:
-    """Refuse a distribution whose draws and densities engines cannot use together."""
-    kind = fn
-    while isinstance(kind, Independent):  # .to_event() of another
-        kind = kind.base_dist
-    if isinstance(kind, MaskedDistribution):
-        raise HumanModelError(
-            f'"{name}" is of a masked distribution, which draws values and has no density of them; '
-            "put pyro.poutine.mask around pyro.sample in place of .mask()"
-        )
-    if isinstance(kind, dist.Delta):
-        raise HumanModelError(
-            f'"{name}" is of dist.Delta, so that nothing is to be inferred; write its value, or '
-            "pyro.deterministic"
-        )
-    if isinstance(kind, dist.VonMises):
-        raise HumanModelError(
-            f'"{name}" is an angle, which has no proposals on the whole line; sample it from '
-            "dist.Uniform, and give its density by pyro.factor"
-        )
-    if fn.support.is_discrete and fn.event_dim:
-        raise HumanModelError(
-            f'"{name}" is discrete with event shape {tuple(fn.event_shape)}; sample numbers, as '
-            "from dist.Categorical, and convert them where they are read"
-        )
-    if not fn.support.is_discrete:
-        try:
-            biject_to(fn.support)
-        except NotImplementedError:
-            raise HumanModelError(
-                f'values of "{name}" cannot be transformed to the whole line; for a mixture, '
-                "sample the component from dist.Categorical and the value given it"
-            ) from None

@@ -117,7 +117,7 @@ def expected_counts(
             _, moments = choices(human, implants, table.belief, table.values, table.acted)
         moments = moments.expand(number, *moments.shape[-2:])
         # Sums of which all terms are impossible have no gradient.
-        moments = moments.clamp(min=IMPROBABLE).clone().requires_grad_()
+        moments = moments.clamp(min=IMPROBABLE).requires_grad_()
         likelihoods = of_moments(human, implants, table, moments)
         joint = combination_scores(table, likelihoods, combinations)[:, 0]
         if log_prior is None:

@@ -63,7 +63,7 @@ class PolicyLikelihoods:
         )
         # Where an action is impossible under a policy, nothing is known of similar policies.
         alone = torch.where(found.isneginf().any(-1), every + 1, 0)
-        key = torch.round(found / resolution).nan_to_num(neginf=0.0).long()
+        key = (found / resolution).round_().nan_to_num_(neginf=0.0).long()
         # Moments with different actions stay apart: each has one entry of ``acted``.
         key = torch.cat([key, views.acted[:, None], alone[:, None]], -1)
         first, cluster = distinct_in_groups(key, views.rounds)

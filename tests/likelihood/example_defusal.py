@@ -10,10 +10,10 @@ WAIT = 0
 ACTIONS = ((WAIT, WAIT, 1, 2, WAIT, WAIT, 4), (3, WAIT, 1), (WAIT, WAIT))
 """Rounds that end with the third press, and one that ends before."""
 TELLING = (1, 4)
-"""When the type is told, and when the second terminal is shown, in the first round."""
+"""When the type is communicated, and when the second terminal is shown, in the first round."""
 
 
-def recorded(courses=ACTIONS, told=True, person="somebody"):
+def recorded(courses=ACTIONS, told=True, person="one"):
     """Rounds of one person."""
     rounds, steps = len(courses), max(len(course) for course in courses)
     actions = torch.full((1, rounds, steps), WAIT)
