@@ -285,6 +285,10 @@ def test_impossible_actions_are_summed_out_with_attention():
         for screening in (Screening(), None)
     )
     assert compile(human, rounds).log_joint(found.draws).isfinite().all()
+    builder = ViewTableBuilder(human, Screening(margin=0, early=0))
+    builder.add(rounds_of(rounds, 0))
+    impossible = builder.score.isneginf().any(0).nonzero().flatten()
+    assert len(impossible) and torch.isin(impossible, builder.alive).all()
     error = (found.evidence_error**2 + plain.evidence_error**2).sqrt()  # each has its own draws
     assert (found.log_evidence - plain.log_evidence).abs() < 5 * error
 
