@@ -170,7 +170,7 @@ class UnreadSite(MirrorWarning):
 
 
 class UnexplainedPerson(MirrorWarning):
-    """Warns that messages are planned for a person whose actions the model does not explain."""
+    """Warns that messages are for a person whose actions the human model does not explain."""
 
 
 class PriorConflict(MirrorWarning):

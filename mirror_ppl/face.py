@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mirror_ppl.checks import require_kind, seed_number, whole_number
+from mirror_ppl.communication.communicator import NOT_EXPLAINED
 from mirror_ppl.communication.communicator import Communicator as PlannedCommunicator
 from mirror_ppl.communication.companion import Companion
 from mirror_ppl.communication.person import Person
@@ -82,6 +83,8 @@ class Communicator(PlannedCommunicator):
         seed: of everything random; the same seed and round give the same decision.
         human: human model of a saved posterior, if it is your own; as for :func:`infer`.
         self_model: the robot's networks of a saved posterior; those that ship unless given.
+        plan_anyway: True to plan messages even if the model check's verdict on the person is
+            ``unexplained``; else such a person gets none.
         settings: of the planner, see :class:`PlannerOptions`; those of the domain unless given.
 
     Raises:
@@ -91,8 +94,7 @@ class Communicator(PlannedCommunicator):
         UnknownNameError: there is no such person, planner or setting.
 
     Warns:
-        UnexplainedPerson: the model check's verdict on the person is ``unexplained``; it never is
-            without held-out rounds.
+        UnexplainedPerson: the model check's verdict on the person is ``unexplained``.
     """
 
     def __init__(
@@ -105,6 +107,7 @@ class Communicator(PlannedCommunicator):
         seed: int = 0,
         human: HumanModel | type[HumanModel] | str | None = None,
         self_model: SelfModel | str | Path | None = None,
+        plan_anyway: bool = False,
         **settings: Any,
     ) -> None:
         if isinstance(fit, str | Path):
@@ -118,15 +121,21 @@ class Communicator(PlannedCommunicator):
             fitted = require_kind(fit, Fit, "fit").person(person)
             own, verdict = fitted.name, fitted.summary["check"]["verdict"]
             listener = fitted.listener(draws)
-        if verdict == UNEXPLAINED:
-            warnings.warn(warning_of([own]), UnexplainedPerson, stacklevel=2)
+        if unexplained := verdict == UNEXPLAINED:
+            said = warning_of([own], "plan_anyway=True", plan_anyway)
+            warnings.warn(said, UnexplainedPerson, stacklevel=2)
         known = [field.name for field in fields(PlannerOptions)]
         for name in settings:
             require_known(name, "setting", known)
         options = PlannerOptions.of(listener.human.domain.name, **settings)
         made = planner_of(planner, listener, options, seed_number(seed))
         super().__init__(
-            made.person, made.objective, made.search, made.min_standard_errors, made.seed
+            made.person,
+            made.objective,
+            made.search,
+            made.min_standard_errors,
+            made.seed,
+            NOT_EXPLAINED if unexplained and not plan_anyway else "",
         )
 
 

@@ -81,6 +81,9 @@ class Options:
     hears: float | None = None
     """Prior probability that messages of a channel reach a person; updated by what they do after
     messages. 1 assumes that all messages reach them; 0.9 unless given."""
+    plan_anyway: bool = False
+    """Plan messages for people whose actions the human model does not explain (verdict
+    unexplained), too; else they get none from mirror, mirror-self-model and mirror-kl."""
     kl_weight: float | None = None
     """Units of reward that mirror-kl gives for a nat; 1 unless given."""
     kl_measure: str | None = None
@@ -161,9 +164,9 @@ def main(options: Options) -> None:
     kept = options.json or options.log or options.film
     posterior, source = _people(options)
     people = _chosen(options, posterior.people)
-    _warn_of_unexplained_people(posterior, people)
     pairing = _pairing(options, posterior, source, people)
     pairing.check()
+    _warn_of_unexplained_people(pairing)
     chosen = _possible(options, chosen, pairing)
     parts = None if kept is None else kept.with_name(f".{kept.name}.parts")
     cells = turns(chosen, people)
@@ -241,16 +244,16 @@ def _pairing(
         planner=planner,
         seed=options.seed,
         keep_log=options.log is not None or options.film is not None,
+        plan_anyway=options.plan_anyway,
     )
 
 
-def _warn_of_unexplained_people(posterior: PosteriorFile, people: Sequence[str]) -> None:
+def _warn_of_unexplained_people(pairing: Pairing) -> None:
     """Print who of the people is not explained by the human model."""
-    from mirror_ppl.inference.results.criticism import UNEXPLAINED, warning_of
+    from mirror_ppl.inference.results.criticism import warning_of
 
-    some = [name for name in people if posterior.verdicts.get(name) == UNEXPLAINED]
-    if some:
-        print(warning_of(some), file=sys.stderr)
+    if some := pairing.unexplained:
+        print(warning_of(some, "--plan-anyway", pairing.plan_anyway), file=sys.stderr)
 
 
 def _possible(options: Options, chosen: tuple[str, ...], pairing: Pairing) -> tuple[str, ...]:

@@ -33,6 +33,9 @@ from mirror_ppl.domains.base import Domain, Observation
 from mirror_ppl.errors import InputError
 from mirror_ppl.models.world_knowledge import planning_domain
 
+NOT_EXPLAINED = "the human model does not explain this person's actions"
+"""The reason for silence to a person with the verdict ``unexplained`` of the model check."""
+
 
 @dataclass(frozen=True, repr=False)
 class Communicator:
@@ -45,6 +48,7 @@ class Communicator:
         min_standard_errors: number of standard errors by which a gain has to exceed 0; 0 chooses
             the largest mean gain.
         seed: of everything random; the same seed and round give the same decision.
+        silent_because: a reason for which no message is planned; empty for planning.
 
     Raises:
         InputError: an argument is of another kind, or the objective is of another domain.
@@ -55,6 +59,7 @@ class Communicator:
     search: Search = Automatic()
     min_standard_errors: float = 2.0
     seed: int = 0
+    silent_because: str = ""
 
     def __post_init__(self) -> None:
         require_kind(self.person, Person, "person")
@@ -68,6 +73,7 @@ class Communicator:
         name = "min_standard_errors"
         object.__setattr__(self, name, real_number(self.min_standard_errors, name, 0.0))
         object.__setattr__(self, "seed", seed_number(self.seed))
+        require_kind(self.silent_because, str, "silent_because")
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({type(self.objective).__name__}, {self.person.number} draws)"
@@ -76,8 +82,8 @@ class Communicator:
     def plan(self, past: RoundSoFar) -> Decision:
         """Plan the message for now.
 
-        Silence is chosen where no message gains enough, and when the round is over: after its last
-        step, or after the task is done.
+        Silence is chosen where no message gains enough, where :attr:`silent_because` gives a
+        reason, and when the round is over: after its last step, or after the task is done.
 
         Raises:
             InputError: the round is impossible at one of its steps, has more steps than rounds of
@@ -96,7 +102,7 @@ class Communicator:
         allowed = channels.join(domain.communicable(now))
         steps_left = domain.horizon - past.time
         over = steps_left < 1 or bool(domain.over(domain.state_behind(now)))
-        if over or not allowed.any():
+        if over or self.silent_because or not allowed.any():
             return self._silence(now, allowed, over)
         context = PlanningContext.of(self.person, past, self.seed)
         allowed = context.telling(allowed)
@@ -136,9 +142,13 @@ class Communicator:
         """
         past = require_kind(past, RoundSoFar, "the round").to(self.person.device)
         past.check(self.person.human.domain)
-        person = self.person.after(past)
         return Communicator(
-            person, self.objective, self.search, self.min_standard_errors, self.seed
+            self.person.after(past),
+            self.objective,
+            self.search,
+            self.min_standard_errors,
+            self.seed,
+            self.silent_because,
         )
 
     def _silence(self, now: Observation, allowed: Tensor, over: bool = False) -> Decision:
@@ -147,7 +157,18 @@ class Communicator:
         domain = self.person.human.domain
         message = Channels(domain).message(none)
         gain = Gain(0.0, 0.0, 0.0)
-        return Decision(message, none, gain, domain, now, None, 0, self._world, over)
+        return Decision(
+            message,
+            none,
+            gain,
+            domain,
+            now,
+            None,
+            0,
+            self._world,
+            over,
+            because=self.silent_because,
+        )
 
     @cached_property
     def _world(self) -> Domain:

@@ -71,6 +71,7 @@ class Decision:
         world: the world as the robot knows it, for advice.
         over: whether the round is over.
         standard_errors: that a gain had to exceed.
+        because: a reason for silence besides gains, if there is one.
     """
 
     message: Message
@@ -83,6 +84,7 @@ class Decision:
     world: Domain
     over: bool = False
     standard_errors: float = 0.0
+    because: str = ""
 
     def __repr__(self) -> str:
         return f"Decision({self.why()})"
@@ -233,6 +235,8 @@ class Decision:
     def _why_not(self) -> str:
         if self.over:
             return "the round is over"
+        if self.because:
+            return self.because
         if self.found is None:
             return "there is nothing new to communicate now"
         for step, message in enumerate(self.plan):

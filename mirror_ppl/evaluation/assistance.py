@@ -79,6 +79,7 @@ class Listener:
         driver: the true person, P = 1.
         start: initial states of the rounds ``[1, R]``, and the noise of the person's choices.
         person: what was inferred of the person, if anything; planners need it.
+        silent_because: a reason for which planners send no messages, see :class:`Communicator`.
     """
 
     domain: Domain
@@ -86,6 +87,7 @@ class Listener:
     driver: SimulatedPeople
     start: Start
     person: Person | None = None
+    silent_because: str = ""
 
     def round(self, number: int) -> Listener:
         """Select one of the person's rounds."""
@@ -150,7 +152,8 @@ def speaker(
     if name not in COMMUNICATORS:
         raise UnknownNameError.of("communicator", name, COMMUNICATORS)
     assert listener.person is not None
-    return Planning(planner_of(name, listener.person, options, seed))
+    planner = planner_of(name, listener.person, options, seed)
+    return Planning(replace(planner, silent_because=listener.silent_because))
 
 
 class Planning:

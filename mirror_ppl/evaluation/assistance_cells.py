@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
+from mirror_ppl.communication.communicator import NOT_EXPLAINED
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.planners import PLANNERS
 from mirror_ppl.domains import Domain, get_domain
@@ -24,6 +25,7 @@ from mirror_ppl.evaluation.assistance import (
     speaker,
 )
 from mirror_ppl.evaluation.played import Played
+from mirror_ppl.inference.results.criticism import UNEXPLAINED
 from mirror_ppl.inference.results.posterior_file import PosteriorFile, load_posterior
 from mirror_ppl.jobs import JsonFormat, Runner
 from mirror_ppl.likelihood.contract import check_contract
@@ -57,6 +59,7 @@ class Pairing:
         seed: of the rounds and of everything random.
         keep_log: True to keep every decision.
         people_model: human model from whose prior the people were drawn, if it is a user's.
+        plan_anyway: True to plan messages for people whom the model does not explain, too.
     """
 
     posterior: Path
@@ -72,6 +75,7 @@ class Pairing:
     seed: int
     keep_log: bool
     people_model: str | None = None
+    plan_anyway: bool = False
 
     @cached_property
     def file(self) -> PosteriorFile:
@@ -162,19 +166,27 @@ class Pairing:
             f"is {recorded:.4g} in the recordings, not {expected:.4g}"
         )
 
+    @property
+    def unexplained(self) -> tuple[str, ...]:
+        """Ids of the people whose actions the human model does not explain."""
+        return tuple(name for name in self.people if self.file.verdicts.get(name) == UNEXPLAINED)
+
     def listeners(self, people: Sequence[str], inferred: bool = True) -> list[Listener]:
         """Return people by id, with their rounds and their posteriors."""
         everybody = self.everybody()
-        found = listeners(everybody, self._simulated, self.setting, self.rounds, self.seed)
-        chosen = [found[self.numbers[person]] for person in people]
+        everyone = listeners(everybody, self._simulated, self.setting, self.rounds, self.seed)
+        chosen = [everyone[self.numbers[person]] for person in people]
         if not inferred:
             return chosen
         draws = self.file.draws(self.human, self.draws)
-        columns = [self.file.people.index(person) for person in people]
-        return [
-            replace(one, person=Person(self.human, {site: v[:, [n]] for site, v in draws.items()}))
-            for n, one in zip(columns, chosen, strict=True)
-        ]
+        silent = () if self.plan_anyway else self.unexplained
+        found = []
+        for person, one in zip(people, chosen, strict=True):
+            column = [self.file.people.index(person)]
+            own = Person(self.human, {site: value[:, column] for site, value in draws.items()})
+            because = NOT_EXPLAINED if person in silent else ""
+            found.append(replace(one, person=own, silent_because=because))
+        return found
 
     def play(
         self, people: Sequence[str], name: str, rates: Sequence[dict[str, float]] | None = None

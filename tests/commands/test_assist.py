@@ -114,14 +114,27 @@ def test_the_table_shows_the_numbers(posterior, capsys):
     assert "2/2" in captured.err
 
 
-def test_it_says_whose_actions_are_not_explained(posterior, tmp_path, capsys):
+def test_who_is_not_explained_gets_no_messages_unless_asked_for(posterior, done, tmp_path, capsys):
     data = az.from_netcdf(posterior)
     data["model_check"]["verdict"] = "person", np.array(["unexplained", "suspect"])
     (tmp_path / "posterior.nc").write_bytes(netcdf_content(data))
     said = "the actions of person-01 are not explained by the human model"
-    for given, expected in ((tmp_path, True), (posterior, False)):
-        assert command(assist, "--posterior", given, *SMALL, "--communicator", "none") == 0
-        assert (said in capsys.readouterr().err) == expected
+    chosen = ("--communicator", "mirror", "none", "--json", tmp_path / "a.json")
+    assert command(assist, "--posterior", tmp_path, *SMALL, *chosen) == 0
+    error = capsys.readouterr().err
+    assert said in error and "no messages are planned for them" in error
+    found, before = (
+        results_of(path)["communicators"] for path in (tmp_path / "a.json", done / "a.json")
+    )
+    silent, planned = (one["mirror"]["net_by_person"] for one in (found, before))
+    assert silent[0] == found["none"]["net_by_person"][0] != planned[0]
+    assert silent[1] == planned[1]
+    anyway = ("--communicator", "mirror", "--json", tmp_path / "b.json", "--plan-anyway")
+    assert command(assist, "--posterior", tmp_path, *SMALL, *anyway) == 0
+    assert "may do harm" in capsys.readouterr().err
+    assert results_of(tmp_path / "b.json")["communicators"]["mirror"]["net_by_person"] == planned
+    assert command(assist, "--posterior", posterior, *SMALL, "--communicator", "none") == 0
+    assert said not in capsys.readouterr().err
 
 
 def test_another_seed_gives_another_result(posterior, done, tmp_path):

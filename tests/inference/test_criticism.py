@@ -3,6 +3,7 @@
 import math
 
 import pytest
+import scipy.stats
 import torch
 from few_reaches import robot_of_few_reaches
 from paths import ROOT
@@ -10,7 +11,13 @@ from paths import ROOT
 import mirror_ppl
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.results import criticism
-from mirror_ppl.inference.results.criticism import base_rate, no_implants, verdict
+from mirror_ppl.inference.results.criticism import (
+    base_rate,
+    lead_of_training,
+    left_out,
+    no_implants,
+    verdict,
+)
 from mirror_ppl.inference.results.posterior_predictive import predict_rounds
 from mirror_ppl.inference.results.summary import predictive
 from mirror_ppl.models.human import HumanModel
@@ -42,7 +49,8 @@ def test_worse_than_how_often_each_was_chosen_is_unexplained():
     assert verdict(late, -surely).word == "suspect"
     assert verdict(fine, surely).word == verdict(late, perhaps).word == "unexplained"
     assert verdict(fine, surely, 38).reasons == (
-        "held-out actions are predicted 0.250 nats worse than by how often each was chosen before",
+        "from other rounds, actions are predicted 0.250 nats worse than by how often each was "
+        "chosen there",
     )
     # One round says nothing of how much rounds differ, unless it cannot be at all.
     assert verdict(fine, surely[:1]).word == "ok"
@@ -77,6 +85,57 @@ def test_without_rounds_before_the_robot_is_as_its_prior(recordings):
     # With rounds the robot's consistency is known, which cannot be worse by much.
     learned = no_implants(self_model, recordings.select_rounds(range(4)), test, 7)
     assert float(learned.mean()) < float(found.mean()) + 0.1
+
+
+@pytest.mark.parametrize("power", [1.0, 0.25])
+def test_a_round_is_predicted_from_the_others(power):
+    """Exact for a coin of unknown bias with a uniform prior, of which each toss is a round."""
+    heads, tails, number = 7, 4, 4000
+    share = (torch.arange(number) + 0.5) / number
+    posterior = scipy.stats.beta(1 + power * heads, 1 + power * tails)
+    bias = torch.from_numpy(posterior.ppf(share.numpy()))
+    tosses = torch.tensor([1.0] * heads + [0.0] * tails)
+    found = left_out(torch.where(tosses > 0, bias[:, None], 1 - bias[:, None]).log(), power)
+    others = tosses.sum() - tosses
+    expected = (1 + power * others) / (2 + power * (heads + tails - 1))
+    expected = torch.where(tosses > 0, expected, 1 - expected)
+    torch.testing.assert_close(found.exp(), expected.double(), atol=1e-3, rtol=0)
+
+
+def test_impossible_draws_do_not_predict_rounds():
+    possible = torch.tensor([[-1.0, -2.0], [-1.0, -2.0]])
+    impossible = torch.tensor([[-math.inf, -2.0]])
+    found = left_out(torch.cat([possible, impossible]), 1.0)
+    torch.testing.assert_close(found, torch.tensor([-1.0, -2.0]).double())
+    assert left_out(impossible, 1.0)[0] == -math.inf
+
+
+def test_training_rounds_are_compared_with_how_often_each_was_chosen_in_others(recordings):
+    train = recordings.select_rounds(range(3))
+    uniform = torch.full((5, 1, *train.actions.shape[1:], 2), math.log(0.5))
+    found = lead_of_training(train, uniform, 2, 1.0)
+    for number, own in enumerate(found):
+        rest = recordings.select_rounds([one for one in range(3) if one != number])
+        often = base_rate(rest, recordings.select_rounds([number]), 2)
+        steps = int(train.mask[0, number].sum())
+        torch.testing.assert_close(own, often.sum() - steps * math.log(2))
+    one = recordings.select_rounds([0])
+    assert not len(lead_of_training(one, uniform[:, :, :1], 2, 1.0))
+
+
+def test_people_without_held_out_rounds_can_be_unexplained(late, monkeypatch):
+    """Here whoever is late and, as far as the model says, does the opposite of what it predicts."""
+    human = HumanModel(robot_of_few_reaches())
+    draws = draw_prior(human, 1, 20, 0)
+    train = late.select_people([1])
+    sure = torch.full((20, 1, *train.actions.shape[1:], 2), math.log(0.01))
+    wrong = 1 - train.actions.clamp(min=0)
+    sure.scatter_(-1, wrong.expand(20, 1, -1, -1)[..., None], math.log(0.99))
+    monkeypatch.setattr(criticism, "perception_p_values", lambda *_: {})
+    found = criticism.criticize(human, (train, None), (sure, None), draws, 0)
+    assert found["verdict"] == "unexplained" and found["nll_base_rate"] is None
+    assert found["reasons"][-1].startswith("from other rounds, actions are predicted ")
+    assert found["reasons"][-1].endswith(" nats worse than by how often each was chosen there")
 
 
 @pytest.fixture(scope="module")

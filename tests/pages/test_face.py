@@ -303,8 +303,8 @@ def test_unreliable_weights_are_reported(fit, recordings, monkeypatch):
     assert repr(found.person()) == "FittedPerson(person-01: 3 rounds; weights not to be relied on)"
 
 
-def test_planning_for_an_unexplained_person_warns(fit, tmp_path):
-    """From a fit and from its file; of others nothing is said."""
+def test_an_unexplained_person_gets_no_messages(fit, recordings, tmp_path):
+    """From a fit and from its file, unless asked for; of others nothing is said."""
     summary = deepcopy(fit.summary)
     summary["people"][0]["check"]["verdict"] = "unexplained"
     data = deepcopy(fit.data)
@@ -313,9 +313,20 @@ def test_planning_for_an_unexplained_person_warns(fit, tmp_path):
     (tmp_path / "posterior.nc").write_bytes(netcdf_content(data))
     first, second = fit.people[:2]
     for source in (other, tmp_path / "posterior.nc"):
-        with pytest.warns(UnexplainedPerson, match=f"actions of {first} are not explained"):
-            mirror_ppl.Communicator(source, first)
+        with pytest.warns(UnexplainedPerson, match=f"{first} are not explained.*no messages are"):
+            silent = mirror_ppl.Communicator(source, first)
+        with pytest.warns(UnexplainedPerson, match=f"{first} are not explained.*may do harm"):
+            speaking = mirror_ppl.Communicator(source, first, plan_anyway=True)
         mirror_ppl.Communicator(source, second)
+        past = RoundSoFar.of(recordings, first, 7, 5)
+        assert speaking.plan(past).found is not None
+        whole = RoundSoFar.of(recordings, first, 6, int(recordings.mask[0, 6].sum()))
+        for planner in (silent, silent.after(whole)):
+            decision = planner.plan(past)
+            assert not decision.message and decision.found is None
+            assert (
+                decision.why() == "silence: the human model does not explain this person's actions"
+            )
 
 
 def test_some_people_are_fitted(tmp_path, monkeypatch, capsys):

@@ -1,8 +1,8 @@
 """Criticism of the human model: a verdict on each person, with reasons.
 
-Besides :mod:`mirror_ppl.inference.results.checks`, the model's predictions of held-out actions are
-compared with two baselines: the person's earlier action shares, independent of the state; and the
-robot itself, without implants.
+Besides :mod:`mirror_ppl.inference.results.checks`, the model's predictions of each round's actions
+from other rounds are compared with the person's action shares in these, independent of the state.
+Predictions of held-out rounds are also compared with the robot itself, without implants.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
+from mirror_ppl.inference.pareto import pareto_smoothed
 from mirror_ppl.inference.results.checks import (
     CHECKS,
     ONE_SIDED,
@@ -47,6 +48,8 @@ LEVEL = 0.05
 """Largest probability that a person whom the model explains is suspect."""
 STANDARD_ERRORS = 2.0
 """Standard errors by which predictions have to be worse to count without other reasons."""
+LEAST_ROUNDS = 2
+"""Least number of training rounds of which each is predicted from the others."""
 DRAWS, QUICK = 100, ImportanceOptions(proposals=64, enough=50.0)
 """Draws and settings for inference in the baseline without implants."""
 
@@ -69,13 +72,13 @@ def verdict(found: Mapping[str, float], lead: Tensor | None, actions: int = 1) -
 
     ``suspect``: a p-value so near to 0 or 1 that at most a share :data:`LEVEL` of people whom the
     model explains have one (Bonferroni over checks). ``unexplained``: suspect, and the model
-    predicts held-out actions worse than the action shares of earlier rounds do; or this difference
-    exceeds :data:`STANDARD_ERRORS` standard errors. ``unchecked``: there are no training rounds.
+    predicts actions worse than the action shares of other rounds do; or this difference exceeds
+    :data:`STANDARD_ERRORS` standard errors. ``unchecked``: there are no training rounds.
 
     Args:
         found: p-values, see :func:`p_values`.
-        lead: log predictive density of each held-out round minus that of those shares, nats,
-            ``[B']``; ``None`` without such rounds.
+        lead: log predictive density of each round given others minus that of those shares, nats,
+            ``[B]``; ``None`` without such rounds.
         actions: number of actions in all of these rounds.
     """
     if not found:
@@ -95,18 +98,29 @@ def verdict(found: Mapping[str, float], lead: Tensor | None, actions: int = 1) -
         if reasons or not math.isfinite(total) or total < -STANDARD_ERRORS * error:
             word = UNEXPLAINED
             reasons.append(
-                f"held-out actions are predicted {-total / actions:.3f} nats worse than by how "
-                "often each was chosen before"
+                f"from other rounds, actions are predicted {-total / actions:.3f} nats worse than "
+                "by how often each was chosen there"
             )
     return Verdict(word, tuple(reasons))
 
 
-def warning_of(people: Sequence[str]) -> str:
-    """Return what to say to those who plan messages for people who are not explained."""
+def warning_of(people: Sequence[str], anyway: str, planned: bool) -> str:
+    """Return what to say to those who plan messages for people who are not explained.
+
+    Args:
+        people: their ids.
+        anyway: setting by which messages are planned for them.
+        planned: True if it is given.
+    """
+    what = (
+        "messages that are planned with it may do harm; another one, such as all, may explain them"
+        if planned
+        else "no messages are planned for them; another one, such as all, may explain them, and "
+        f"{anyway} plans with this one"
+    )
     return (
         f"the actions of {', '.join(people)} are not explained by the human model (verdict "
-        f"{UNEXPLAINED}): messages that are planned with it may do harm; another one, such as all, "
-        "may explain them"
+        f"{UNEXPLAINED}): {what}"
     )
 
 
@@ -132,6 +146,51 @@ def action_shares(train: Demonstrations, actions: int) -> Tensor:
 def base_rate(train: Demonstrations, test: Demonstrations, actions: int) -> Tensor:
     """Negative log-likelihood of held-out actions ``[N']`` of one person under earlier shares."""
     return -action_shares(train, actions)[0].log()[test.actions[test.mask]]
+
+
+def left_out(log_likelihood: Tensor, power: float) -> Tensor:
+    """Log predictive density ``[B]`` of each training round given the others (PSIS-LOO).
+
+    Where its importance weights are unreliable, as the round surprises the model, it is too high.
+
+    Args:
+        log_likelihood: of the rounds under posterior draws, ``[S, B]``.
+        power: :attr:`HumanModel.likelihood_power`.
+    """
+    found = []
+    for own in log_likelihood.double().T:
+        possible = own[own.isfinite()]
+        if not len(possible):
+            found.append(own.new_tensor(-math.inf))
+            continue
+        weights, _ = pareto_smoothed(-power * possible)
+        found.append(torch.logsumexp(weights + possible, 0))
+    return torch.stack(found)
+
+
+def lead_of_training(
+    train: Demonstrations, log_probabilities: Tensor, actions: int, power: float
+) -> Tensor:
+    """Log density ``[B]`` of each training round given the others minus that of action shares.
+
+    Args:
+        train: training rounds of one person.
+        log_probabilities: of actions there, ``[S, 1, B, T, A]``.
+        actions: number of actions A.
+        power: :attr:`HumanModel.likelihood_power`.
+
+    Returns:
+        Nats of each round with a decision; empty if there is but one, which has no others.
+    """
+    real = train.mask[0].any(-1)
+    if int(real.sum()) < LEAST_ROUNDS:
+        return torch.zeros(0)
+    density = chosen_log_probability(log_probabilities, train).sum(-1)[:, 0]  # [S, B]
+    done = torch.nn.functional.one_hot(train.actions[0].clamp(min=0), actions)
+    counts = (done * train.mask[0, ..., None]).sum(1)  # [B, A]
+    others = counts.sum(0) - counts + 1 / 2
+    shares = (others / others.sum(-1, True)).log()
+    return (left_out(density[:, real], power) - (counts * shares).sum(-1)[real]).float()
 
 
 def no_implants(
@@ -181,17 +240,21 @@ def criticize(
     generator = torch.Generator().manual_seed(seed)
     found = p_values(steps, domain.actions, generator)
     found |= perception_p_values(human, train, draws, generator)
-    often = robot = lead = None
+    own, power = train.to("cpu"), human.likelihood_power
+    leads = [lead_of_training(own, log_probabilities[0], len(domain.actions), power)]
+    number = int(own.mask.sum()) if len(leads[0]) else 0
+    often = robot = None
     if test is not None and log_probabilities[1] is not None and bool(test.mask.any()):
         own = test.to("cpu")
         often = base_rate(train.to("cpu"), own, len(domain.actions))
         mixed = predictive(log_probabilities[1])[None]
         lead = torch.zeros(own.mask.shape[1:]).to(often)
         lead[own.mask[0]] = often + chosen_log_probability(mixed, own)[0, own.mask]
-        lead = lead.sum(-1)[own.mask[0].any(-1)]
+        leads.append(lead.sum(-1)[own.mask[0].any(-1)])
+        number += len(often)
         if isinstance(human.self_model, SelfModel):
             robot = no_implants(human.self_model, train, test, seed)
-    judged = verdict(found, lead, 1 if often is None else len(often))
+    judged = verdict(found, torch.cat(leads), number)
     return {
         "verdict": judged.word,
         "reasons": list(judged.reasons),
