@@ -98,7 +98,7 @@ def test_what_one_round_contradicts_is_kept_until_others_agree(self_model, recor
 def test_merging_moves_likelihoods_by_at_most_the_resolution(self_model, recordings, kind):
     human, rounds = kind(self_model), ragged(recordings, [[15, 9]])
     resolution = 0.1
-    screening = Screening(margin=math.inf, resolution=resolution, merge_policies=8)
+    screening = Screening(margin=math.inf, resolution=resolution, policies=16, merge_policies=8)
     whole, merged = ViewTableBuilder(human, None), ViewTableBuilder(human, screening)
     for builder in (whole, merged):
         builder.add(rounds_of(rounds, 0))
