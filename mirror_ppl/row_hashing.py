@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
 
 import torch
@@ -50,6 +51,15 @@ def distinct_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
     first = torch.full((len(values),), len(rows), device=rows.device)
     first.scatter_reduce_(0, inverse, torch.arange(len(rows), device=rows.device), "amin")
     return first, inverse
+
+
+def seed_of(values: Mapping[str, Tensor]) -> int:
+    """Hash of numbers, to be used as a seed."""
+    total = 0
+    for value in values.values():
+        whole = as_whole_numbers(value).flatten()
+        total += int((whole * random_keys(len(whole), whole.device)).sum())
+    return total % 2**62
 
 
 def as_whole_numbers(values: Tensor) -> Tensor:

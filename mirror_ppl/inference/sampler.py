@@ -164,14 +164,21 @@ class Sampler:
     def prune(self, margin: float) -> None:
         """Drop combinations that are behind the best by more than ``margin`` nats under every draw.
 
-        Draws have to be from the prior. None is dropped if the program adds factors or observed
-        sites under which too few of the draws are effective. Those are kept that are impossible
-        under a draw, as under others they may be the most probable.
+        Draws have to be from the prior. As none of them may resemble the person, those are kept,
+        too, that are not behind under :attr:`ViewTable.likely`. None is dropped if the program adds
+        factors or observed sites under which too few of the draws are effective. Those are kept
+        that are impossible under a draw, as under others they may be the most probable.
         """
         joint, said = torch.cat(self._joints), torch.cat(self._corrections)
         if float(said.max() - said.min()) > 0 and effective(said) < min(ENOUGH, len(said) / 2):
             return
         keep = within(self.human, joint + said[:, None], margin) | joint.isneginf().any(0)
+        likely = {s: own for s, own in self.table.likely.items() if s not in self.table.sites}
+        if likely:
+            number = len(next(iter(likely.values())))
+            added = log_correction(self.human, self._perceived, likely, 1)[:, 0].expand(number)
+            every = torch.cat([joint, self._joint(likely, number)])
+            keep |= within(self.human, every + torch.cat([said, added])[:, None], margin)
         if self.combinations.fixed:
             keep &= self.combinations.log_prior.isfinite()
         self.combinations = self.combinations.kept(keep)

@@ -79,10 +79,13 @@ def _drawn_policies(
     weights = torch.softmax(torch.cat(found).double().cpu(), 0)
     chosen = torch.multinomial(weights, number, replacement=True, generator=generator)
     parts = []
-    for draw in chosen.tolist():
-        own = draw_prior(human, 1, size, seeds[draw // size])
-        parts.append({name: value[draw % size, None] for name, value in own.items()})
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    for batch in (chosen // size).unique().tolist():
+        own = draw_prior(human, 1, size, seeds[batch])
+        rows = chosen[chosen // size == batch] % size
+        parts.append({name: value[rows.to(value.device)] for name, value in own.items()})
+    # In random order, as fewer of them distinguish moments.
+    order = torch.randperm(number, generator=generator)
+    return {name: torch.cat([part[name] for part in parts])[order] for name in parts[0]}
 
 
 def effective(log_weights: Tensor) -> float:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mirror_ppl.likelihood.attention import AttentionValues
 from mirror_ppl.likelihood.densities import choices, log_weighted_latents
-from mirror_ppl.likelihood.round_views import ManyViews, distinct_in_groups
+from mirror_ppl.likelihood.round_views import ManyViews, RoundViews, distinct_in_groups
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.sums import Sums
 from mirror_ppl.likelihood.view_table import NO_VIEW
@@ -87,7 +87,9 @@ class PolicyLikelihoods:
         number = kinds * (screening.merge_policies if kinds == 1 else max(1, KINDS_MERGE // kinds))
         return {name: policy[:number] for name, policy in self.policies.items()}
 
-    def of_views(self, views: ManyViews, policies: Mapping[str, Tensor] | None = None) -> Tensor:
+    def of_views(
+        self, views: ManyViews | RoundViews, policies: Mapping[str, Tensor] | None = None
+    ) -> Tensor:
         """Return those of the recorded actions under each policy and view, ``[policies, V]``.
 
         Args:
@@ -112,7 +114,10 @@ class PolicyLikelihoods:
         return likelihoods + probabilities[:, 0]
 
     def _of_moments(
-        self, policies: Mapping[str, Tensor], views: ManyViews, some: Tensor | slice = slice(None)
+        self,
+        policies: Mapping[str, Tensor],
+        views: ManyViews | RoundViews,
+        some: Tensor | slice = slice(None),
     ) -> Tensor:
         """Return those ``[policies, N]`` of the record at some moments."""
         moments = (one[None, some] for one in (views.belief, views.values, views.acted))

@@ -26,7 +26,7 @@ class Screening:
 
     margin: float = 15.0
     early: float = 25.0
-    policies: int = 64
+    policies: int = 16
     seed: int = 0
     resolution: float = 0.03
     merge_policies: int = 16

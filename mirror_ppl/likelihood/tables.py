@@ -232,6 +232,7 @@ def join_tables(
         steps=torch.stack([recorded(table.steps[0]) for table in tables]),
         view_counts=torch.cat([table.view_counts for table in tables]),
         attention=attention,
+        likely={},
     )
 
 

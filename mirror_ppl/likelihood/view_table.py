@@ -139,6 +139,8 @@ class ViewTable:
         attention: round latents, if the model has any: sampled values, or a chain that is summed
             out exactly. Views of a chain are of spans: their moments outside of these are
             ``NO_VIEW``.
+        likely: values ``[S, 1, 1, ...]`` of other sites under which one person's rounds are
+            probable (of a table of several people, none).
     """
 
     sites: tuple[str, ...]
@@ -152,6 +154,7 @@ class ViewTable:
     steps: Tensor
     view_counts: Tensor
     attention: Attention | Chain | None = None
+    likely: dict[str, Tensor] = field(default_factory=dict)
 
     @cached_property
     def _steps_of_views(self) -> Sums:

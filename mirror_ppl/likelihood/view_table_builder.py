@@ -3,12 +3,13 @@
 Every combination of the discrete implants is a candidate. After some rounds, candidates are dropped
 whose likelihood is far below the best one's under every policy. Later rounds need no views of them,
 and exact marginalization stays cheap. A candidate is kept if recorded actions are impossible under
-it and some policy: with other policies it may be the most probable one.
+it and some policy: with other policies it may be the most probable one. It is also kept if it is
+not far below under :mod:`mirror_ppl.likelihood.likely_policies`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
 from math import prod
@@ -27,24 +28,18 @@ from mirror_ppl.likelihood.combinations import (
     perceived_sites,
     require_own_attention,
 )
-from mirror_ppl.likelihood.densities import (
-    require_compilable,
-)
+from mirror_ppl.likelihood.densities import require_compilable
+from mirror_ppl.likelihood.likely_policies import LikelyPolicies
 from mirror_ppl.likelihood.policies import draw_policies, within
 from mirror_ppl.likelihood.policy_likelihoods import PolicyLikelihoods
-from mirror_ppl.likelihood.round_views import (
-    ManyViews,
-    Rounds,
-    RoundViews,
-    views_of_rounds,
-)
+from mirror_ppl.likelihood.round_views import ManyViews, Rounds, RoundViews, views_of_rounds
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.telling import MANY, some_of, telling_first
 from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable
 from mirror_ppl.limits import require_memory
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
-from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
+from mirror_ppl.row_hashing import distinct_rows, seed_of
 
 SCREENED_ROWS, MOST_ROWS = 4096, 32768
 """Combinations of discrete implants times rounds that are processed at once. With screening,
@@ -120,6 +115,15 @@ class ViewTableBuilder:
         self._recorded: list[tuple[Tensor, Tensor]] = []
         self._attended: list[AttentionValues] = []
         self._proposal: Proposal | None = None
+        # Policies are not compared with sampled attention, nor if there are some for each kind.
+        self._likely: LikelyPolicies | None = None
+        if (
+            self.policies
+            and likely is None
+            and not (human.has_round_latents or human.stratified_by)
+        ):
+            assert screening is not None
+            self._likely = LikelyPolicies(human, self.grid, screening.seed + 1)
         if human.has_round_latents:
             require_own_attention(human, supports)
         if human.has_round_latents and not human.chained:
@@ -241,7 +245,7 @@ class ViewTableBuilder:
         """Sampled values of attention in a round, and the round's seed."""
         so_far, actions = one.so_far(0)
         recorded = {**one.observation, "actions": one.actions}
-        seed = _number_of({name: value[:, one.real[0]] for name, value in recorded.items()})
+        seed = seed_of({name: value[:, one.real[0]] for name, value in recorded.items()})
         covariates = self.human.covariates(so_far)
         attended = proposal.values(
             self._weights(),
@@ -293,18 +297,28 @@ class ViewTableBuilder:
         # With the prior, whose factors and observed sites may rule combinations out.
         joint = score + self.log_prior[:, alive]
         margin = screening.margin_after(len(self._rounds))
-        spared = score.isneginf().any(0) & self.log_prior[:, alive].isfinite().any(0)
-        self.alive = alive[within(self.human, joint, margin) | spared]
+        keep = score.isneginf().any(0) & self.log_prior[:, alive].isfinite().any(0)
+        keep |= within(self.human, joint, margin)
+        if self._likely is not None:
+            rounds = list(zip(self._rounds, self._views(), strict=True))
+            more = self._likely.log_joint(rounds, alive, joint.amax(0))
+            keep |= within(self.human, torch.cat([joint, more]), margin)
+        self.alive = alive[keep]
+
+    def _views(self) -> Iterator[Tensor]:
+        """Iterate over rounds: the view of each combination ``[M]`` that was alive."""
+        for alive, seen in self._seen:
+            view = torch.full((prod(self.sizes),), NO_VIEW, device=alive.device)
+            view[alive] = seen
+            yield view
 
     def table(self) -> ViewTable:
         """Build the table of the views that are left; needs at least one round."""
         index, rounds, sights, views, moments = [], [], 0, 0, 0
         shifted, attended, chains, counts = [], [], [], []
         steps = max(len(real) for _, real in self._recorded)
-        for part, (combination, view) in zip(self._rounds, self._seen, strict=True):
+        for part, row in zip(self._rounds, self._views(), strict=True):
             # Keep only views of combinations that were never dropped.
-            row = torch.full((prod(self.sizes),), NO_VIEW, device=self.alive.device)
-            row[combination] = view
             needed, place = torch.unique(row[self.alive], return_inverse=True)
             row = torch.full_like(row, NO_VIEW)
             row[self.alive] = sights + place
@@ -336,6 +350,7 @@ class ViewTableBuilder:
             steps=self._padded_to(steps, 1)[None],
             view_counts=torch.tensor([views]),
             attention=attention,
+            likely={} if self._likely is None else self._likely.policies,
         )
 
     def _weights(self) -> Tensor:
@@ -370,12 +385,3 @@ def _bytes_of_a_view(human: HumanModel) -> int:
     """Memory for what is perceived at a step, about; masks, assumed numbers, and copies."""
     numbers = sum(len(m.items) * (1 + len(m.features)) for m in human.domain.modalities)
     return 4 * 4 * numbers  # copies as measured in driving
-
-
-def _number_of(values: Mapping[str, Tensor]) -> int:
-    """Hash of a recording, to be used as a seed."""
-    total = 0
-    for value in values.values():
-        whole = as_whole_numbers(value).flatten()
-        total += int((whole * random_keys(len(whole), whole.device)).sum())
-    return total % 2**62
