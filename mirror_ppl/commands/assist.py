@@ -301,6 +301,7 @@ def _contents(
                 if name not in ("json", "log", "film", "jobs", "scheduler")
             },
             "posterior": dict(posterior.attributes),
+            "unexplained": list(pairing.unexplained),
             "communicators": summary,
         }
         if "mirror" in played:

@@ -126,6 +126,7 @@ def test_who_is_not_explained_gets_no_messages_unless_asked_for(posterior, done,
     found, before = (
         results_of(path)["communicators"] for path in (tmp_path / "a.json", done / "a.json")
     )
+    assert results_of(tmp_path / "a.json")["unexplained"] == ["person-01"]
     silent, planned = (one["mirror"]["net_by_person"] for one in (found, before))
     assert silent[0] == found["none"]["net_by_person"][0] != planned[0]
     assert silent[1] == planned[1]
