@@ -68,7 +68,7 @@ def main(options: Options) -> None:
             pairing = Pairing(
                 posterior, None, None, 64, options.setting, options.population, 0, people,
                 options.rounds, PlannerOptions.of("driving", horizon=horizon, patience=patience),
-                options.seed, False,
+                options.seed, False, plan_anyway=True,
             )  # fmt: skip
             parts = torch.stack([lost(pairing, person) for person in people]).mean(0)
             columns = " ".join(f"{part:>6.3f}" for part in (parts.sum(), *parts))

@@ -24,8 +24,9 @@ from mirror_ppl.timing import clocked, stage
 if TYPE_CHECKING:
     import pandas as pd
 
-NLLS = ("nll", "nll_base_rate", "nll_no_implants")
-"""Columns of the model check, in nats an action of held-out rounds."""
+NLLS = ("nll", "nll_base_rate", "nll_no_implants", "nll_left_out", "nll_left_out_base_rate")
+"""Columns of the model check in nats an action: of held-out rounds, and the last two of training
+rounds, each predicted from the others."""
 RESULTS = ("summary.json", "posterior.nc", *FILES)
 """Names of all files that a fit may write."""
 
@@ -69,7 +70,9 @@ class Fit(fitting.Fit):
         """Model check, one row per person: verdict, reasons, held-out NLLs, p-values.
 
         ``nll`` (nats an action of held-out rounds) stands beside ``nll_base_rate`` (of the base
-        rate of each action) and ``nll_no_implants`` (if the person were the robot). p-values are
+        rate of each action) and ``nll_no_implants`` (if the person were the robot);
+        ``nll_left_out`` (of training rounds, each predicted from the others) stands beside that of
+        the base rate in these. p-values are
         near 0 where there is more of something than the model predicts, near 1 where there is less.
         With the human model ``all``, ``p(<model>)`` are the probabilities of its models.
         """
@@ -86,7 +89,7 @@ class Fit(fitting.Fit):
                 | told["p_values"]
             )
         table = pd.DataFrame(rows, index=pd.Index(self.people, name="person"))
-        return table.astype(dict.fromkeys(NLLS, float))  # NaN without held-out rounds
+        return table.astype(dict.fromkeys(NLLS, float))  # NaN without such rounds
 
     def person(self, name: str | None = None) -> FittedPerson:
         """Select one of the people; the only one unless named.

@@ -83,7 +83,8 @@ class Options:
     messages. 1 assumes that all messages reach them; 0.9 unless given."""
     plan_anyway: bool = False
     """Plan messages for people whose actions the human model does not explain (verdict
-    unexplained), too; else they get none from mirror, mirror-self-model and mirror-kl."""
+    unexplained), too; else they get none from mirror, mirror-self-model and mirror-kl, nor from
+    random, which has the rates of mirror."""
     kl_weight: float | None = None
     """Units of reward that mirror-kl gives for a nat; 1 unless given."""
     kl_measure: str | None = None
@@ -166,8 +167,8 @@ def main(options: Options) -> None:
     people = _chosen(options, posterior.people)
     pairing = _pairing(options, posterior, source, people)
     pairing.check()
-    _warn_of_unexplained_people(pairing)
     chosen = _possible(options, chosen, pairing)
+    _warn_of_unexplained_people(pairing, chosen)
     parts = None if kept is None else kept.with_name(f".{kept.name}.parts")
     cells = turns(chosen, people)
     with ExitStack() as stack:
@@ -248,11 +249,13 @@ def _pairing(
     )
 
 
-def _warn_of_unexplained_people(pairing: Pairing) -> None:
-    """Print who of the people is not explained by the human model."""
+def _warn_of_unexplained_people(pairing: Pairing, chosen: Sequence[str]) -> None:
+    """Print who of the people is not explained by the human model, if planners are chosen."""
+    from mirror_ppl.communication.planners import PLANNERS
     from mirror_ppl.inference.results.criticism import warning_of
 
-    if some := pairing.unexplained:
+    planning = not {*PLANNERS, "random"}.isdisjoint(chosen)
+    if planning and (some := pairing.unexplained):
         print(warning_of(some, "--plan-anyway", pairing.plan_anyway), file=sys.stderr)
 
 

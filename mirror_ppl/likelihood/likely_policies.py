@@ -27,6 +27,9 @@ BEST = 32
 FIRST = 2
 """Number of rounds after which they are chosen; and again whenever there are twice as many."""
 
+RoundSeen = tuple[RoundViews, tuple[Tensor, Tensor]]
+"""Views of a round; numbers of the combinations that were alive then, and the view of each."""
+
 
 class LikelyPolicies:
     """Policies under which one person's rounds so far are most probable.
@@ -45,16 +48,20 @@ class LikelyPolicies:
         self.grid = grid
         self.seed = seed
         self.policies: Draws = {}
+        self._combinations = len(next(iter(grid.values()), (0,)))
         self._score = self._log_prior = torch.zeros(0)
         self._scored = self._chosen_after = 0
 
     def log_joint(
-        self, rounds: Sequence[tuple[RoundViews, Tensor]], alive: Tensor, best: Tensor
+        self,
+        rounds: Sequence[RoundSeen],
+        alive: Tensor,
+        best: Tensor,
     ) -> Tensor:
         """Log joint ``[S, M']`` of the rounds so far and the combinations, under each policy.
 
         Args:
-            rounds: the views of each round, and the view of each combination ``[M]``.
+            rounds: all rounds so far, those of earlier calls first.
             alive: numbers of the combinations ``[M']``; no others from now on.
             best: log joint of each under the best of other policies ``[M']``.
         """
@@ -68,28 +75,31 @@ class LikelyPolicies:
         self._scored = len(rounds)
         return (self._score + self._log_prior)[:, alive]
 
-    def _choose(self, rounds: Sequence[tuple[RoundViews, Tensor]], some: Tensor) -> None:
+    def _choose(self, rounds: Sequence[RoundSeen], some: Tensor) -> None:
         """Choose policies under which rounds are most probable, if only ``some`` are alive."""
-        drawn = draw_policies(self.human, self.grid, POOL, self.seed)
+        drawn = draw_policies(self.human, self.grid, POOL, self.seed, distinct=True)
         if drawn is None:  # no prior draws represent the program
             return
-        likely = self._log_likelihoods(drawn, rounds, some).logsumexp(-1).topk(CHOSEN).indices
+        score = self._log_likelihoods(drawn, rounds, some).logsumexp(-1)
+        likely = score.topk(min(CHOSEN, len(score))).indices
         self.policies = {name: policy[likely] for name, policy in drawn.items()}
         others = {site: own for site, own in self.policies.items() if site not in self.grid}
         self._log_prior = log_priors(self.human, self.grid, others, 1)[:, 0]
-        self._score = self._log_prior.new_zeros(CHOSEN, self._log_prior.shape[-1])
+        self._score = self._log_prior.new_zeros(len(likely), self._log_prior.shape[-1])
         self._scored, self._chosen_after = 0, len(rounds)
 
     def _log_likelihoods(
         self,
         policies: Draws,
-        rounds: Sequence[tuple[RoundViews, Tensor]],
+        rounds: Sequence[RoundSeen],
         combinations: Tensor,
     ) -> Tensor:
         """Log-likelihoods of rounds under policies and combinations, ``[S, M']``."""
         likelihoods = PolicyLikelihoods(self.human, policies, len(next(iter(policies.values()))))
         total = combinations.new_zeros((), dtype=torch.float32)
-        for part, view in rounds:
+        for part, (numbers, seen) in rounds:
+            view = seen.new_zeros(self._combinations)
+            view[numbers] = seen
             needed, place = view[combinations].unique(return_inverse=True)
             total = total + likelihoods.of_views(part.kept(needed))[:, place]
         return total

@@ -29,7 +29,7 @@ ENTRIES = 4_000_000
 
 @torch.no_grad()
 def draw_policies(
-    human: HumanModel, grid: Mapping[str, Tensor], number: int, seed: int
+    human: HumanModel, grid: Mapping[str, Tensor], number: int, seed: int, distinct: bool = False
 ) -> Draws | None:
     """Draw policies ``[S, 1, 1, ...]``; deterministic given the seed.
 
@@ -38,6 +38,7 @@ def draw_policies(
         grid: values ``[M]`` of the discrete sites that perception reads, for each combination.
         number: number of policies S.
         seed: seed of the draws.
+        distinct: True for no draw twice, and for fewer policies if there are not as many draws.
 
     Returns:
         The policies; ``None`` if too few prior draws are effective. If ``stratified_by`` names a
@@ -46,7 +47,7 @@ def draw_policies(
     Raises:
         HumanModelError: ``stratified_by`` is no discrete site.
     """
-    found = _drawn_policies(human, grid, number, seed)
+    found = _drawn_policies(human, grid, number, seed, distinct)
     site = human.stratified_by
     if found is None or site is None:
         return found
@@ -62,7 +63,7 @@ def draw_policies(
 
 
 def _drawn_policies(
-    human: HumanModel, grid: Mapping[str, Tensor], number: int, seed: int
+    human: HumanModel, grid: Mapping[str, Tensor], number: int, seed: int, distinct: bool
 ) -> Draws | None:
     if not adds_to_prior(human):
         return draw_prior(human, 1, number, seed)
@@ -77,7 +78,9 @@ def _drawn_policies(
         return None
     generator = torch.Generator().manual_seed(seed)
     weights = torch.softmax(torch.cat(found).double().cpu(), 0)
-    chosen = torch.multinomial(weights, number, replacement=True, generator=generator)
+    if distinct:
+        number = min(number, int((weights > 0).sum()))
+    chosen = torch.multinomial(weights, number, replacement=not distinct, generator=generator)
     parts = []
     for batch in (chosen // size).unique().tolist():
         own = draw_prior(human, 1, size, seeds[batch])

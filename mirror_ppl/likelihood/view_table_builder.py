@@ -9,7 +9,7 @@ not far below under :mod:`mirror_ppl.likelihood.likely_policies`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from math import prod
@@ -300,25 +300,20 @@ class ViewTableBuilder:
         keep = score.isneginf().any(0) & self.log_prior[:, alive].isfinite().any(0)
         keep |= within(self.human, joint, margin)
         if self._likely is not None:
-            rounds = list(zip(self._rounds, self._views(), strict=True))
+            rounds = list(zip(self._rounds, self._seen, strict=True))
             more = self._likely.log_joint(rounds, alive, joint.amax(0))
             keep |= within(self.human, torch.cat([joint, more]), margin)
         self.alive = alive[keep]
-
-    def _views(self) -> Iterator[Tensor]:
-        """Iterate over rounds: the view of each combination ``[M]`` that was alive."""
-        for alive, seen in self._seen:
-            view = torch.full((prod(self.sizes),), NO_VIEW, device=alive.device)
-            view[alive] = seen
-            yield view
 
     def table(self) -> ViewTable:
         """Build the table of the views that are left; needs at least one round."""
         index, rounds, sights, views, moments = [], [], 0, 0, 0
         shifted, attended, chains, counts = [], [], [], []
         steps = max(len(real) for _, real in self._recorded)
-        for part, row in zip(self._rounds, self._views(), strict=True):
+        for part, (combination, view) in zip(self._rounds, self._seen, strict=True):
             # Keep only views of combinations that were never dropped.
+            row = torch.full((prod(self.sizes),), NO_VIEW, device=self.alive.device)
+            row[combination] = view
             needed, place = torch.unique(row[self.alive], return_inverse=True)
             row = torch.full_like(row, NO_VIEW)
             row[self.alive] = sights + place

@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+import pyro
 import pytest
 import scipy.stats
 import torch
@@ -11,13 +13,8 @@ from paths import ROOT
 import mirror_ppl
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.results import criticism
-from mirror_ppl.inference.results.criticism import (
-    base_rate,
-    lead_of_training,
-    left_out,
-    no_implants,
-    verdict,
-)
+from mirror_ppl.inference.results.criticism import Comparison, base_rate, no_implants, verdict
+from mirror_ppl.inference.results.left_out import _without, left_out
 from mirror_ppl.inference.results.posterior_predictive import predict_rounds
 from mirror_ppl.inference.results.summary import predictive
 from mirror_ppl.models.human import HumanModel
@@ -30,33 +27,39 @@ from mirror_ppl.models.weights import load_self_model, shipped_weights
 def test_a_p_value_near_0_or_1_makes_suspect():
     """With five checks a person is suspect if a p-value is below .005 or above .995."""
     fine = {"delayed": 0.3, "switches": 0.01, "reward": 0.9, "surprise": 0.5, "share of stay": 0.99}
-    assert verdict(fine, None) == criticism.Verdict("ok")
-    found = verdict(fine | {"switches": 0.004, "reward": 0.9999}, None)
+    assert verdict(fine) == criticism.Verdict("ok")
+    found = verdict(fine | {"switches": 0.004, "reward": 0.9999})
     assert found.word == "suspect"
     assert found.reasons == (
         "earns less than the model says (p < 0.001)",
         "changes what they do more often than the model says (p = 0.008)",
     )
-    (reason,) = verdict(fine | {"share of stay": 1.0}, None).reasons
+    (reason,) = verdict(fine | {"share of stay": 1.0}).reasons
     assert reason == 'does "stay" less often than the model says (p < 0.001)'
 
 
 def test_worse_than_how_often_each_was_chosen_is_unexplained():
     fine, late = {"delayed": 0.5}, {"delayed": 0.0}
-    surely = torch.tensor([-2.0, -3.0, -2.5, -2.0])
-    perhaps = torch.tensor([-9.0, 8.0, -7.0, 6.0])
-    assert verdict(fine, -surely).word == verdict(fine, perhaps).word == "ok"
-    assert verdict(late, -surely).word == "suspect"
-    assert verdict(fine, surely).word == verdict(late, perhaps).word == "unexplained"
-    assert verdict(fine, surely, 38).reasons == (
+
+    def of(*nats, actions=38):
+        return Comparison(torch.tensor(nats), actions)
+
+    surely, perhaps = of(-2.0, -3.0, -2.5, -2.0), of(-9.0, 8.0, -7.0, 6.0)
+    better = of(2.0, 3.0, 2.5, 2.0)
+    assert verdict(fine, [better]).word == verdict(fine, [perhaps]).word == "ok"
+    assert verdict(late, [better]).word == "suspect"
+    assert verdict(fine, [surely]).word == verdict(late, [perhaps]).word == "unexplained"
+    # One comparison suffices, that of held-out rounds or of all.
+    assert verdict(fine, [better, surely]).word == verdict(fine, [surely, better]).word
+    assert verdict(fine, [better, surely]).reasons == (
         "from other rounds, actions are predicted 0.250 nats worse than by how often each was "
         "chosen there",
     )
-    # One round says nothing of how much rounds differ, unless it cannot be at all.
-    assert verdict(fine, surely[:1]).word == "ok"
-    assert verdict({}, surely).word == verdict({}, None).word == "unchecked"
-    assert verdict(fine, torch.tensor([1.0, -math.inf])).word == "unexplained"
-    assert verdict(fine, surely[:0]).word == "ok"
+    # Few rounds say little of how much rounds differ, one says nothing, unless it cannot be at all.
+    assert not of(-2.0, -3.0).sure and of(-2.0, -3.0, -2.0).sure
+    assert verdict(fine, [of(-2.0)]).word == "ok"
+    assert verdict({}, [surely]).word == verdict({}).word == "unchecked"
+    assert verdict(fine, [of(1.0, -math.inf)]).word == "unexplained"
 
 
 @pytest.fixture(scope="module")
@@ -89,38 +92,52 @@ def test_without_rounds_before_the_robot_is_as_its_prior(recordings):
 
 @pytest.mark.parametrize("power", [1.0, 0.25])
 def test_a_round_is_predicted_from_the_others(power):
-    """Exact for a coin of unknown bias with a uniform prior, of which each toss is a round."""
-    heads, tails, number = 7, 4, 4000
-    share = (torch.arange(number) + 0.5) / number
-    posterior = scipy.stats.beta(1 + power * heads, 1 + power * tails)
-    bias = torch.from_numpy(posterior.ppf(share.numpy()))
-    tosses = torch.tensor([1.0] * heads + [0.0] * tails)
-    found = left_out(torch.where(tosses > 0, bias[:, None], 1 - bias[:, None]).log(), power)
-    others = tosses.sum() - tosses
-    expected = (1 + power * others) / (2 + power * (heads + tails - 1))
-    expected = torch.where(tosses > 0, expected, 1 - expected)
-    torch.testing.assert_close(found.exp(), expected.double(), atol=1e-3, rtol=0)
+    """Exact for a coin of unknown bias with a uniform prior, tossed twice in each round."""
+    rounds = torch.tensor([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [0.0, 1.0]])
+    heads, tosses, number = rounds.sum(), rounds.numel(), 4000
+    posterior = scipy.stats.beta(1 + power * heads, 1 + power * (tosses - heads))
+    bias = torch.from_numpy(posterior.ppf((np.arange(number) + 0.5) / number))
+    for own in rounds:
+        log_probability = torch.where(own > 0, bias[:, None], 1 - bias[:, None]).log()
+        found, _ = _without(log_probability, power)
+        chance = (1 + power * (heads - own.sum())) / (2 + power * (tosses - 2))
+        expected = torch.where(own > 0, chance, 1 - chance).log().sum()
+        torch.testing.assert_close(found, expected.double(), atol=2e-3, rtol=0)
 
 
 def test_impossible_draws_do_not_predict_rounds():
-    possible = torch.tensor([[-1.0, -2.0], [-1.0, -2.0]])
-    impossible = torch.tensor([[-math.inf, -2.0]])
-    found = left_out(torch.cat([possible, impossible]), 1.0)
-    torch.testing.assert_close(found, torch.tensor([-1.0, -2.0]).double())
-    assert left_out(impossible, 1.0)[0] == -math.inf
+    possible = torch.tensor([[-1.0, -2.0], [-1.0, -2.0]]).double()
+    impossible = torch.tensor([[-math.inf, -2.0]]).double()
+    found, _ = _without(torch.cat([possible, impossible]), 1.0)
+    assert float(found) == pytest.approx(-3.0)
+    assert _without(impossible, 1.0) == (-math.inf, math.inf)
 
 
 def test_training_rounds_are_compared_with_how_often_each_was_chosen_in_others(recordings):
     train = recordings.select_rounds(range(3))
+    human = HumanModel(load_self_model(shipped_weights("driving"))[0])
     uniform = torch.full((5, 1, *train.actions.shape[1:], 2), math.log(0.5))
-    found = lead_of_training(train, uniform, 2, 1.0)
-    for number, own in enumerate(found):
+    found = left_out(human, train, uniform)
+    for number in range(3):
         rest = recordings.select_rounds([one for one in range(3) if one != number])
         often = base_rate(rest, recordings.select_rounds([number]), 2)
         steps = int(train.mask[0, number].sum())
-        torch.testing.assert_close(own, often.sum() - steps * math.log(2))
-    one = recordings.select_rounds([0])
-    assert not len(lead_of_training(one, uniform[:, :, :1], 2, 1.0))
+        torch.testing.assert_close(found.shares[number].float(), -often.sum())
+        torch.testing.assert_close(found.model[number], torch.tensor(-steps * math.log(2)).double())
+    assert found.actions == int(train.mask.sum()) and found.pareto_k == -math.inf
+    assert left_out(human, recordings.select_rounds([0]), uniform[:, :, :1]) is None
+
+
+def test_rounds_are_not_left_out_where_actions_alone_do_not_weigh_draws(recordings):
+    class Watched(HumanModel):
+        def act(self, implants, belief, values):
+            pyro.factor("gaze", 0.1 * implants["lapse"])
+            return super().act(implants, belief, values)
+
+    train = recordings.select_rounds(range(3))
+    uniform = torch.full((5, 1, *train.actions.shape[1:], 2), math.log(0.5))
+    human = Watched(load_self_model(shipped_weights("driving"))[0])
+    assert left_out(human, train, uniform) is None
 
 
 def test_people_without_held_out_rounds_can_be_unexplained(late, monkeypatch):
@@ -170,6 +187,8 @@ def test_a_fit_says_who_is_late(late):
     group = fit.data["model_check"]
     assert list(group["verdict"].values) == list(check["verdict"])
     assert group["p_value"].sel(person="person-02", check="delayed") == check["delayed"].iloc[1]
-    for name in ("nll", "nll_base_rate", "nll_no_implants"):
+    left_out = "nll_left_out", "nll_left_out_base_rate"
+    assert check.loc[:, left_out].notna().all(axis=None) and own["pareto_k_left_out"] is not None
+    for name in ("nll", "nll_base_rate", "nll_no_implants", *left_out):
         assert list(group[name].values) == list(check[name])
     assert len(fit.plot.check().axes) == 2

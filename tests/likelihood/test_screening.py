@@ -114,7 +114,8 @@ def test_policies_near_the_person_are_the_most_probable_ones(self_model, recordi
     grid = combination_values(human, table)
     # Views are numbered from round to round.
     rounds = [
-        (views_of(table, 0).kept(views.unique()), views - views.min()) for views in table.index[0]
+        (views_of(table, 0).kept(views.unique()), (torch.arange(14), views - views.min()))
+        for views in table.index[0]
     ]
     found, every, best = LikelyPolicies(human, grid, 5), torch.arange(14), torch.arange(14.0)
     assert found.log_joint(rounds[:1], every, best).shape == (0, 14) and not found.policies
@@ -129,9 +130,7 @@ def test_policies_near_the_person_are_the_most_probable_ones(self_model, recordi
     more = found.log_joint([*rounds, rounds[0]], every, best)
     again, _ = scores_under(human, chosen, build_view_table(human, own.select_rounds([0])), grid)
     torch.testing.assert_close(more, joint + again, rtol=1e-4, atol=1e-3)
-    assert found.policies is not None and all(
-        found.policies[site] is chosen[site] for site in chosen
-    )
+    assert all(found.policies[site] is chosen[site] for site in chosen)
     found.log_joint([*rounds, rounds[0], *rounds[:3]], every, best)
     assert any(found.policies[site] is not chosen[site] for site in chosen)
 
@@ -177,7 +176,7 @@ def test_what_one_round_contradicts_is_kept_until_others_agree(self_model, recor
 def test_merging_moves_likelihoods_by_at_most_the_resolution(self_model, recordings, kind):
     human, rounds = kind(self_model), ragged(recordings, [[15, 9]])
     resolution = 0.1
-    screening = Screening(margin=math.inf, resolution=resolution, policies=16, merge_policies=8)
+    screening = Screening(margin=math.inf, resolution=resolution, merge_policies=8)
     whole, merged = ViewTableBuilder(human, None), ViewTableBuilder(human, screening)
     for builder in (whole, merged):
         builder.add(rounds_of(rounds, 0))

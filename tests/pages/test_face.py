@@ -313,9 +313,13 @@ def test_an_unexplained_person_gets_no_messages(fit, recordings, tmp_path):
     (tmp_path / "posterior.nc").write_bytes(netcdf_content(data))
     first, second = fit.people[:2]
     for source in (other, tmp_path / "posterior.nc"):
-        with pytest.warns(UnexplainedPerson, match=f"{first} are not explained.*no messages are"):
+        with pytest.warns(
+            UnexplainedPerson, match=f"not explain the actions of {first} .*no messages are"
+        ):
             silent = mirror_ppl.Communicator(source, first)
-        with pytest.warns(UnexplainedPerson, match=f"{first} are not explained.*may do harm"):
+        with pytest.warns(
+            UnexplainedPerson, match=f"not explain the actions of {first} .*may do harm"
+        ):
             speaking = mirror_ppl.Communicator(source, first, plan_anyway=True)
         mirror_ppl.Communicator(source, second)
         past = RoundSoFar.of(recordings, first, 7, 5)

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
-from mirror_ppl.inference.pareto import pareto_smoothed
 from mirror_ppl.inference.results.checks import (
     CHECKS,
     ONE_SIDED,
@@ -27,6 +26,7 @@ from mirror_ppl.inference.results.checks import (
     steps_of,
     tail,
 )
+from mirror_ppl.inference.results.left_out import LeftOut, left_out
 from mirror_ppl.inference.results.perception_checks import perception_p_values
 from mirror_ppl.inference.results.posterior_predictive import chosen_log_probability, predict_rounds
 from mirror_ppl.inference.results.summary import predictive
@@ -44,12 +44,12 @@ OK, SUSPECT, UNEXPLAINED, UNCHECKED = "ok", "suspect", "unexplained", "unchecked
 """The verdicts."""
 FINE = OK, UNCHECKED
 """Verdicts that are no warning."""
+LEFT_OUT = "nll_left_out", "nll_left_out_base_rate", "pareto_k_left_out"
+"""What is stored of training rounds that are predicted from the others."""
 LEVEL = 0.05
 """Largest probability that a person whom the model explains is suspect."""
-STANDARD_ERRORS = 2.0
-"""Standard errors by which predictions have to be worse to count without other reasons."""
-LEAST_ROUNDS = 2
-"""Least number of training rounds of which each is predicted from the others."""
+SURELY_WORSE = 0.975
+"""One-sided confidence at which predictions have to be worse to count without other reasons."""
 DRAWS, QUICK = 100, ImportanceOptions(proposals=64, enough=50.0)
 """Draws and settings for inference in the baseline without implants."""
 
@@ -67,19 +67,50 @@ class Verdict:
     reasons: tuple[str, ...] = ()
 
 
-def verdict(found: Mapping[str, float], lead: Tensor | None, actions: int = 1) -> Verdict:
+@dataclass(frozen=True)
+class Comparison:
+    """Comparison of the model with action shares: which predicts rounds better from others.
+
+    Attributes:
+        difference: log density of each round by the model minus that by action shares, ``[B]``.
+        actions: number of actions in all of these rounds.
+    """
+
+    difference: Tensor
+    actions: int
+
+    @property
+    def total(self) -> float:
+        """Nats by which the model is better."""
+        return float(self.difference.sum())
+
+    @property
+    def sure(self) -> bool:
+        """True if the model is worse with a confidence of :data:`SURELY_WORSE`."""
+        from scipy.stats import t
+
+        if not math.isfinite(self.total):
+            return True
+        # Rounds are the sample: actions within a round depend on each other.
+        number = len(self.difference)
+        if number < 2:  # noqa: PLR2004 - no spread
+            return False
+        error = float(self.difference.std()) * number**0.5
+        return self.total < -float(t.ppf(SURELY_WORSE, number - 1)) * error
+
+
+def verdict(found: Mapping[str, float], comparisons: Sequence[Comparison] = ()) -> Verdict:
     """Compute the verdict on a person.
 
     ``suspect``: a p-value so near to 0 or 1 that at most a share :data:`LEVEL` of people whom the
-    model explains have one (Bonferroni over checks). ``unexplained``: suspect, and the model
-    predicts actions worse than the action shares of other rounds do; or this difference exceeds
-    :data:`STANDARD_ERRORS` standard errors. ``unchecked``: there are no training rounds.
+    model explains have one (Bonferroni over checks). ``unexplained``: by one of the comparisons,
+    the model predicts actions worse than the action shares of other rounds do, and the person is
+    suspect, or it does with a confidence of :data:`SURELY_WORSE` (Student's t over rounds).
+    ``unchecked``: there are no training rounds.
 
     Args:
         found: p-values, see :func:`p_values`.
-        lead: log predictive density of each round given others minus that of those shares, nats,
-            ``[B]``; ``None`` without such rounds.
-        actions: number of actions in all of these rounds.
+        comparisons: of the model with those shares.
     """
     if not found:
         return Verdict(UNCHECKED)
@@ -91,16 +122,14 @@ def verdict(found: Mapping[str, float], lead: Tensor | None, actions: int = 1) -
             size = f"p < {least:.3f}" if tails[name] < least else f"p = {tails[name]:.3f}"
             reasons.append(f"{_says(name, found[name] < 1 / 2)} ({size})")
     word = SUSPECT if reasons else OK
-    if lead is not None and len(lead) and lead.sum() < 0:
-        total, number = float(lead.sum()), len(lead)
-        # Rounds are the sample: actions within a round depend on each other.
-        error = float(lead.std()) * number**0.5 if number > 1 else math.inf
-        if reasons or not math.isfinite(total) or total < -STANDARD_ERRORS * error:
-            word = UNEXPLAINED
-            reasons.append(
-                f"from other rounds, actions are predicted {-total / actions:.3f} nats worse than "
-                "by how often each was chosen there"
-            )
+    worse = [one for one in comparisons if one.total < 0 and (reasons or one.sure)]
+    if worse:
+        word = UNEXPLAINED
+        nats = max(-one.total / one.actions for one in worse)
+        reasons.append(
+            f"from other rounds, actions are predicted {nats:.3f} nats worse than by how often "
+            "each was chosen there"
+        )
     return Verdict(word, tuple(reasons))
 
 
@@ -112,15 +141,11 @@ def warning_of(people: Sequence[str], anyway: str, planned: bool) -> str:
         anyway: setting by which messages are planned for them.
         planned: True if it is given.
     """
-    what = (
-        "messages that are planned with it may do harm; another one, such as all, may explain them"
-        if planned
-        else "no messages are planned for them; another one, such as all, may explain them, and "
-        f"{anyway} plans with this one"
-    )
+    what = "these may do harm" if planned else f"{anyway} plans some all the same"
+    messages = "messages are planned for them" if planned else "no messages are planned for them"
     return (
-        f"the actions of {', '.join(people)} are not explained by the human model (verdict "
-        f"{UNEXPLAINED}): {what}"
+        f"the human model does not explain the actions of {', '.join(people)} (verdict "
+        f"{UNEXPLAINED}): {messages}, and {what}; another human model may explain their actions"
     )
 
 
@@ -146,51 +171,6 @@ def action_shares(train: Demonstrations, actions: int) -> Tensor:
 def base_rate(train: Demonstrations, test: Demonstrations, actions: int) -> Tensor:
     """Negative log-likelihood of held-out actions ``[N']`` of one person under earlier shares."""
     return -action_shares(train, actions)[0].log()[test.actions[test.mask]]
-
-
-def left_out(log_likelihood: Tensor, power: float) -> Tensor:
-    """Log predictive density ``[B]`` of each training round given the others (PSIS-LOO).
-
-    Where its importance weights are unreliable, as the round surprises the model, it is too high.
-
-    Args:
-        log_likelihood: of the rounds under posterior draws, ``[S, B]``.
-        power: :attr:`HumanModel.likelihood_power`.
-    """
-    found = []
-    for own in log_likelihood.double().T:
-        possible = own[own.isfinite()]
-        if not len(possible):
-            found.append(own.new_tensor(-math.inf))
-            continue
-        weights, _ = pareto_smoothed(-power * possible)
-        found.append(torch.logsumexp(weights + possible, 0))
-    return torch.stack(found)
-
-
-def lead_of_training(
-    train: Demonstrations, log_probabilities: Tensor, actions: int, power: float
-) -> Tensor:
-    """Log density ``[B]`` of each training round given the others minus that of action shares.
-
-    Args:
-        train: training rounds of one person.
-        log_probabilities: of actions there, ``[S, 1, B, T, A]``.
-        actions: number of actions A.
-        power: :attr:`HumanModel.likelihood_power`.
-
-    Returns:
-        Nats of each round with a decision; empty if there is but one, which has no others.
-    """
-    real = train.mask[0].any(-1)
-    if int(real.sum()) < LEAST_ROUNDS:
-        return torch.zeros(0)
-    density = chosen_log_probability(log_probabilities, train).sum(-1)[:, 0]  # [S, B]
-    done = torch.nn.functional.one_hot(train.actions[0].clamp(min=0), actions)
-    counts = (done * train.mask[0, ..., None]).sum(1)  # [B, A]
-    others = counts.sum(0) - counts + 1 / 2
-    shares = (others / others.sum(-1, True)).log()
-    return (left_out(density[:, real], power) - (counts * shares).sum(-1)[real]).float()
 
 
 def no_implants(
@@ -233,35 +213,45 @@ def criticize(
 
     Returns:
         ``verdict``, ``reasons``, ``p_values`` by name, ``nll_base_rate`` and ``nll_no_implants``
-        (``None`` without held-out rounds).
+        (``None`` without held-out rounds), and :data:`LEFT_OUT` (``None`` where there are no such
+        predictions, see :func:`left_out`; Pareto k also where all weights are equal).
     """
     domain, (train, test) = human.domain, rounds
     steps = steps_of(domain, train.to("cpu"), log_probabilities[0])
     generator = torch.Generator().manual_seed(seed)
     found = p_values(steps, domain.actions, generator)
     found |= perception_p_values(human, train, draws, generator)
-    own, power = train.to("cpu"), human.likelihood_power
-    leads = [lead_of_training(own, log_probabilities[0], len(domain.actions), power)]
-    number = int(own.mask.sum()) if len(leads[0]) else 0
-    often = robot = None
+    comparisons, often, robot = [], None, None
     if test is not None and log_probabilities[1] is not None and bool(test.mask.any()):
         own = test.to("cpu")
         often = base_rate(train.to("cpu"), own, len(domain.actions))
         mixed = predictive(log_probabilities[1])[None]
         lead = torch.zeros(own.mask.shape[1:]).to(often)
         lead[own.mask[0]] = often + chosen_log_probability(mixed, own)[0, own.mask]
-        leads.append(lead.sum(-1)[own.mask[0].any(-1)])
-        number += len(often)
+        comparisons.append(Comparison(lead.sum(-1)[own.mask[0].any(-1)].double(), len(often)))
         if isinstance(human.self_model, SelfModel):
             robot = no_implants(human.self_model, train, test, seed)
-    judged = verdict(found, torch.cat(leads), number)
+    if (others := left_out(human, train.to("cpu"), log_probabilities[0])) is not None:
+        every = [one.difference for one in comparisons] + [others.difference]
+        actions = sum(one.actions for one in comparisons) + others.actions
+        comparisons.append(Comparison(torch.cat(every), actions))
+    judged = verdict(found, comparisons)
     return {
         "verdict": judged.word,
         "reasons": list(judged.reasons),
         "p_values": found,
         "nll_base_rate": None if often is None else float(often.mean()),
         "nll_no_implants": None if robot is None else float(robot.mean()),
-    }
+    } | _of_left_out(others)
+
+
+def _of_left_out(others: LeftOut | None) -> dict[str, float | None]:
+    """Training rounds, each predicted from the others: nats an action, and Pareto k."""
+    if others is None:
+        return dict.fromkeys(LEFT_OUT)
+    nats = [-float(one.sum()) / others.actions for one in (others.model, others.shares)]
+    known = [value if math.isfinite(value) else None for value in (*nats, others.pareto_k)]
+    return dict(zip(LEFT_OUT, known, strict=True))
 
 
 def models_of(human: OneOfKinds, kind: Tensor) -> dict[str, float]:

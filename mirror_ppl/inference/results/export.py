@@ -132,6 +132,10 @@ def add_identifiability(
     data.add_groups({"identifiability": group})
 
 
+NLLS = ("nll_base_rate", "nll_no_implants", "nll_left_out", "nll_left_out_base_rate")
+"""Negative log-likelihoods of the model check, in nats an action."""
+
+
 def add_check(
     data: az.InferenceData,
     people: Sequence[Mapping[str, Any]],
@@ -149,7 +153,7 @@ def add_check(
     values = [[check["p_values"].get(name, math.nan) for name in names] for check in checks]
     nats: dict[str, list[float | None]] = {
         "nll": [(one["test"] or {}).get("nll") for one in people],
-        **{name: [one[name] for one in checks] for name in ("nll_base_rate", "nll_no_implants")},
+        **{name: [one[name] for one in checks] for name in NLLS},
         **{name: [one.get(name) for one in people] for name in ("log_evidence", "evidence_error")},
     }
     group = xr.Dataset(
