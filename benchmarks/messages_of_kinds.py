@@ -152,6 +152,7 @@ def table(rows: Sequence[dict[str, str]]) -> str:
         gain = interval(reward - cost - silent)
         unexplained = np.array([row["verdict"] == UNEXPLAINED for row in own])
         kept = interval(np.where(unexplained, 0.0, reward - cost - silent))
+        known = all(row["verdict"] for row in own)
         cells = [
             kind,
             f"`{fitted}`",
@@ -160,8 +161,8 @@ def table(rows: Sequence[dict[str, str]]) -> str:
             f"{(reward - cost).mean():.2f}",
             f"{gain.mean:.2f} [{gain.low:.2f}, {gain.high:.2f}]",
             f"{cost.mean():.3f}",
-            f"{unexplained.sum()}",
-            f"{kept.mean:.2f} [{kept.low:.2f}, {kept.high:.2f}]",
+            f"{unexplained.sum()}" if known else "-",
+            f"{kept.mean:.2f} [{kept.low:.2f}, {kept.high:.2f}]" if known else "-",
         ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)

@@ -16,7 +16,8 @@ class Screening:
             under its best policy, after many rounds.
         early: nats by which the margin is larger after the first round. After n rounds it is
             ``margin + early / n``, since later rounds can contradict early ones.
-        policies: number of policies, which are draws of the implants from the prior.
+        policies: number of policies, which are draws of the implants from the prior. Others near
+            the person are added to them (:mod:`mirror_ppl.likelihood.likely_policies`).
         seed: seed of those draws.
         resolution: grid width for merging moments of a round: they are merged if their recorded
             actions' log-probabilities under ``merge_policies`` policies round to the same grid
