@@ -19,7 +19,13 @@ if TYPE_CHECKING:
 ROW, COLUMN = 0.34, 0.62
 """Inches of a person and of a check."""
 LIKELIHOODS = 3.6
-"""Inches of the panel of held-out actions."""
+"""Inches of the panel of likelihoods."""
+MODEL = BLUE, "o", 7, "the model"
+BASE_RATE = BLACK, "|", 14, "base rate of each action"
+NO_IMPLANTS = ORANGE, "D", 7, "no implants"
+"""Colour, marker, its size and the name of each prediction."""
+HELD_OUT = {"nll_no_implants": NO_IMPLANTS, "nll": MODEL, "nll_base_rate": BASE_RATE}
+LEFT_OUT = {"nll_left_out": MODEL, "nll_left_out_base_rate": BASE_RATE}
 LEAST_WIDTH, CHARACTER = 1.4, 0.09
 """Inches of the left panel without ids, and of a character of an id."""
 WRAP, DARK = 12, 2.3
@@ -28,12 +34,13 @@ MOST_PEOPLE = 60
 
 
 def plot_model_check(data: az.InferenceData) -> Picture:
-    """Draw each person's posterior predictive checks and likelihoods of held-out actions.
+    """Draw each person's posterior predictive checks and likelihoods of actions.
 
     Left: p-values, two-sided but for those of perception, with an arrow up (blue) where there is
     more than the model predicts and down (red) where there is less; frames mark those that make a
-    person suspect. Right, if rounds were held out: NLL in nats an action of the model, of the base
-    rate of each action, and of the model without implants.
+    person suspect. Right, NLL in nats an action of held-out rounds: of the model, of the base rate
+    of each action, and of the model without implants. If none were held out, those of training
+    rounds, each predicted from the others: of the model and of the base rate.
 
     Args:
         data: with the group ``model_check``; of more than 60 people the first are drawn.
@@ -44,16 +51,16 @@ def plot_model_check(data: az.InferenceData) -> Picture:
         label if verdict in FINE else f"{label} ({verdict})"
         for label, verdict in zip(labels, group["verdict"].values, strict=True)
     ]
-    tested = bool(np.isfinite(group["nll"].values).any())
+    shown = _shown(group)
     checks = len(group["check"])
     least = LEAST_WIDTH + COLUMN * max(checks, 3) + CHARACTER * max(map(len, labels))
-    widths = [least, LIKELIHOODS][: 1 + tested]
+    widths = [least, LIKELIHOODS][: 1 + bool(shown)]
     figure = Picture(figsize=(sum(widths), ROW * len(labels) + 2.4), layout="constrained")
     axes = figure.subplots(1, len(widths), width_ratios=widths, squeeze=False)[0]
     _p_values(axes[0], group)
     axes[0].set_yticks(range(len(labels)), labels)
-    if tested:
-        _likelihoods(axes[1], group)
+    if shown:
+        _likelihoods(axes[1], group, shown)
     for ax in axes:
         ax.set_ylim(len(labels) - 0.5, -0.5)
         ax.spines[:].set_visible(False)
@@ -139,17 +146,21 @@ def _name_group(ax, first: int, last: int, name: str) -> None:
     )
 
 
-def _likelihoods(ax, group: xr.Dataset) -> None:
+def _shown(group: xr.Dataset) -> dict[str, tuple[str, str, int, str]]:
+    """Likelihoods that are drawn, with their looks; none if there are none."""
+    for looks in (HELD_OUT, LEFT_OUT):
+        if all(name in group for name in looks) and np.isfinite(group[[*looks][-1]].values).any():
+            return looks
+    return {}
+
+
+def _likelihoods(ax, group: xr.Dataset, looks: dict[str, tuple[str, str, int, str]]) -> None:
     rows = np.arange(len(group["person"]))
-    for name, colour, marker, size, label in (
-        ("nll_no_implants", ORANGE, "D", 7, "no implants"),
-        ("nll", BLUE, "o", 7, "the model"),
-        ("nll_base_rate", BLACK, "|", 14, "base rate of each action"),
-    ):
+    for name, (colour, marker, size, label) in looks.items():
         ax.plot(group[name].values, rows, marker, color=colour, label=label, mew=2, ms=size)
-    values = [group[name].values for name in ("nll_base_rate", "nll_no_implants", "nll")]
-    ax.set_xlim(0, 1.08 * float(np.nanmax(values)))
+    ax.set_xlim(0, 1.08 * float(np.nanmax([group[name].values for name in looks])))
     ax.set_yticks([])
     ax.set_xlabel("nats an action; less is better")
-    ax.set_title("Held-out actions", fontsize=11)
+    what = "Held-out actions" if looks is HELD_OUT else "Left-out rounds"
+    ax.set_title(what, fontsize=11)
     ax.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1, 0.5))

@@ -11,6 +11,7 @@ from few_reaches import robot_of_few_reaches
 from paths import ROOT
 
 import mirror_ppl
+from mirror_ppl.arviz import az
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.results import criticism
 from mirror_ppl.inference.results.criticism import Comparison, base_rate, no_implants, verdict
@@ -22,6 +23,7 @@ from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.plots.model_check import plot_model_check
 
 
 def test_a_p_value_near_0_or_1_makes_suspect():
@@ -191,4 +193,16 @@ def test_a_fit_says_who_is_late(late):
     assert check.loc[:, left_out].notna().all(axis=None) and own["pareto_k_left_out"] is not None
     for name in ("nll", "nll_base_rate", "nll_no_implants", *left_out):
         assert list(group[name].values) == list(check[name])
-    assert len(fit.plot.check().axes) == 2
+    assert [ax.get_title() for ax in fit.plot.check().axes][1:] == ["Held-out actions"]
+    # Without held-out rounds, those of training rounds are drawn; without any, none.
+    data = az.InferenceData(model_check=group.copy())
+    for name in ("nll", "nll_base_rate", "nll_no_implants"):
+        data["model_check"][name][:] = np.nan
+    axes = plot_model_check(data).axes
+    assert [ax.get_title() for ax in axes][1:] == ["Left-out rounds"]
+    drawn = {line.get_label(): list(line.get_xdata()) for line in axes[1].lines}
+    assert drawn["the model"] == list(check["nll_left_out"])
+    assert drawn["base rate of each action"] == list(check["nll_left_out_base_rate"])
+    for name in left_out:
+        data["model_check"][name][:] = np.nan
+    assert len(plot_model_check(data).axes) == 1
