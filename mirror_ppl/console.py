@@ -115,6 +115,7 @@ def _run(
                 description=description_of(description),
                 args=args,
                 registry=registry_for(options_class),
+                config=(tyro.conf.FlagCreatePairsOff,),  # no --no-OPTION beside --OPTION
             )
     except SystemExit as end:
         if end.code:

@@ -355,8 +355,8 @@ def test_draws_that_hold_the_record_impossible_do_not_count(human, rounds, draws
 
 def test_only_small_p_values_of_perception_are_reasons():
     others = {"reward": 0.4, "surprise": 0.5}
-    assert verdict(others | {"missed": 0.9999, "forgot": 1.0}, None).word == "ok"
-    found = verdict(others | {"missed": 0.012, "forgot": 0.2}, None)
+    assert verdict(others | {"missed": 0.9999, "forgot": 1.0}).word == "ok"
+    found = verdict(others | {"missed": 0.012, "forgot": 0.2})
     assert found.word == "suspect"
     assert found.reasons == (
         "is better explained by noticing late, or missing, what the model says they see "

@@ -159,6 +159,7 @@ def test_options_and_communicators_of_assist_are_as_on_the_page():
     text, options = page("docs/communicator.md"), assist.Options()
     shown = {row[0].strip("`-").replace("-", "_"): row[1] for row in table_of(text, "Option")}
     assert shown.pop("communicator") == "all of them" and options.communicator == ()
+    assert shown.pop("plan_anyway") == "off" and options.plan_anyway is False
     domains = ("horizon", "enumerate_above", "patience", "min_standard_errors", "discount", "hears")
     for name in domains:
         assert shown.pop(name) == "the domain's" and getattr(options, name) is None
