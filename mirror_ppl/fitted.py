@@ -14,7 +14,7 @@ from mirror_ppl.domains import require_known
 from mirror_ppl.errors import InputError
 from mirror_ppl.files import json_text, write_together
 from mirror_ppl.inference.results import fitting
-from mirror_ppl.inference.results.criticism import FINE
+from mirror_ppl.inference.results.criticism import FINE, NLLS
 from mirror_ppl.inference.results.export import netcdf_content
 from mirror_ppl.inference.weighted import HIGH_PARETO_K
 from mirror_ppl.limits import LIMITS
@@ -24,9 +24,6 @@ from mirror_ppl.timing import clocked, stage
 if TYPE_CHECKING:
     import pandas as pd
 
-NLLS = ("nll", "nll_base_rate", "nll_no_implants", "nll_left_out", "nll_left_out_base_rate")
-"""Columns of the model check in nats an action: of held-out rounds, and the last two of training
-rounds, each predicted from the others."""
 RESULTS = ("summary.json", "posterior.nc", *FILES)
 """Names of all files that a fit may write."""
 
@@ -84,12 +81,12 @@ class Fit(fitting.Fit):
             rows.append(
                 {"verdict": told.pop("verdict"), "reasons": "; ".join(told.pop("reasons"))}
                 | {"nll": (person["test"] or {}).get("nll")}
-                | {name: told[name] for name in NLLS[1:]}
+                | {name: told[name] for name in NLLS}
                 | {f"p({name})": value for name, value in told.get("models", {}).items()}
                 | told["p_values"]
             )
         table = pd.DataFrame(rows, index=pd.Index(self.people, name="person"))
-        return table.astype(dict.fromkeys(NLLS, float))  # NaN without such rounds
+        return table.astype(dict.fromkeys(("nll", *NLLS), float))  # NaN without such rounds
 
     def person(self, name: str | None = None) -> FittedPerson:
         """Select one of the people; the only one unless named.

@@ -135,6 +135,23 @@ def test_policies_near_the_person_are_the_most_probable_ones(self_model, recordi
     assert any(found.policies[site] is not chosen[site] for site in chosen)
 
 
+def test_policies_near_the_person_are_chosen_among_distinct_draws(self_model):
+    """A factor leaves few prior draws, of which resampling takes some several times."""
+
+    class Careful(HumanModel):
+        def prior(self):
+            implants = super().prior()
+            pyro.factor("careful", -30 * (implants["lapse"] - 0.01).abs())
+            return implants
+
+    human = Careful(self_model)
+    found = {
+        distinct: draw_policies(human, {}, 256, 0, distinct)["consistency"].unique()
+        for distinct in (False, True)
+    }
+    assert len(found[False]) < len(found[True]) == 256
+
+
 def test_whom_the_robots_values_hardly_move_keeps_their_thresholds(self_model):
     """Prior draws alone leave 19 of 9,604 combinations, without the true one."""
     human = Preferring(self_model)

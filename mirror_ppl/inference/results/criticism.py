@@ -44,7 +44,10 @@ OK, SUSPECT, UNEXPLAINED, UNCHECKED = "ok", "suspect", "unexplained", "unchecked
 """The verdicts."""
 FINE = OK, UNCHECKED
 """Verdicts that are no warning."""
-LEFT_OUT = "nll_left_out", "nll_left_out_base_rate", "pareto_k_left_out"
+NLLS = "nll_base_rate", "nll_no_implants", "nll_left_out", "nll_left_out_base_rate"
+"""Stored negative log-likelihoods, in nats an action: of held-out rounds, and the last two of
+training rounds, each predicted from the others."""
+LEFT_OUT = (*NLLS[2:], "pareto_k_left_out")
 """What is stored of training rounds that are predicted from the others."""
 LEVEL = 0.05
 """Largest probability that a person whom the model explains is suspect."""

@@ -28,6 +28,7 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.domains import get_domain
 from mirror_ppl.files import write_whole
+from mirror_ppl.inference.results.criticism import NLLS
 from mirror_ppl.inference.results.identifiability import Identifiability
 from mirror_ppl.inference.results.predictions import Predictions
 from mirror_ppl.models.implants import SIGHT, in_units
@@ -130,10 +131,6 @@ def add_identifiability(
     for name in group.data_vars:
         group[name].attrs["units"] = "nats"
     data.add_groups({"identifiability": group})
-
-
-NLLS = ("nll_base_rate", "nll_no_implants", "nll_left_out", "nll_left_out_base_rate")
-"""Negative log-likelihoods of the model check, in nats an action."""
 
 
 def add_check(
