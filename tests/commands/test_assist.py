@@ -6,13 +6,11 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import h5py
-import numpy as np
 import pytest
 from paths import EXAMPLES
 from running import command
 
 from mirror_ppl import infer
-from mirror_ppl.arviz import az
 from mirror_ppl.commands import assist, fit
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.domains import get_domain
@@ -112,31 +110,6 @@ def test_the_table_shows_the_numbers(posterior, capsys):
     assert worth.index(" none ") < worth.index(" oracle ")
     assert all(len(line) <= 80 for line in captured.out.splitlines())
     assert "2/2" in captured.err
-
-
-def test_who_is_not_explained_gets_no_messages_unless_asked_for(posterior, done, tmp_path, capsys):
-    data = az.from_netcdf(posterior)
-    data["model_check"]["verdict"] = "person", np.array(["unexplained", "suspect"])
-    (tmp_path / "posterior.nc").write_bytes(netcdf_content(data))
-    said = "the human model does not explain the actions of person-01 (verdict unexplained)"
-    chosen = ("--communicator", "mirror", "none", "--json", tmp_path / "a.json")
-    assert command(assist, "--posterior", tmp_path, *SMALL, *chosen) == 0
-    error = capsys.readouterr().err
-    assert said in error and "no messages are planned for them" in error
-    found, before = (
-        results_of(path)["communicators"] for path in (tmp_path / "a.json", done / "a.json")
-    )
-    assert results_of(tmp_path / "a.json")["unexplained"] == ["person-01"]
-    silent, planned = (one["mirror"]["net_by_person"] for one in (found, before))
-    assert silent[0] == found["none"]["net_by_person"][0] != planned[0]
-    assert silent[1] == planned[1]
-    anyway = ("--communicator", "mirror", "--json", tmp_path / "b.json", "--plan-anyway")
-    assert command(assist, "--posterior", tmp_path, *SMALL, *anyway) == 0
-    assert "may do harm" in capsys.readouterr().err
-    assert results_of(tmp_path / "b.json")["communicators"]["mirror"]["net_by_person"] == planned
-    for given in (posterior, tmp_path):  # a rule plans nothing
-        assert command(assist, "--posterior", given, *SMALL, "--communicator", "none") == 0
-        assert said not in capsys.readouterr().err
 
 
 def test_another_seed_gives_another_result(posterior, done, tmp_path):

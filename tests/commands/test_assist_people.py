@@ -4,12 +4,14 @@ import copy
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from paths import ROOT
 from running import command
 
 import mirror_ppl
+from mirror_ppl.arviz import az
 from mirror_ppl.commands import assist
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.results.export import netcdf_content
@@ -201,3 +203,31 @@ def test_people_of_another_self_model_or_of_a_user_s_model_are_refused(
         assert command(assist, "--posterior", path, *SMALL, "--communicator", "none") == 2
         error = capsys.readouterr().err
         assert error.count("\n") == 1 and message in error
+
+
+def test_who_is_not_explained_gets_no_messages_unless_asked_for(posterior_of, tmp_path, capsys):
+    recordings = load_demonstrations(asset_path("driving_fog_paper.nc"))
+    path = posterior_of(recordings.select_people([0, 1]), train_rounds=2, draws=6)
+    data = az.from_netcdf(path)
+    data["model_check"]["verdict"] = "person", np.array(["unexplained", "suspect"])
+    (tmp_path / "posterior.nc").write_bytes(netcdf_content(data))
+    said = "the human model does not explain the actions of person-01 (verdict unexplained)"
+
+    def played(*chosen):
+        out = ("--json", tmp_path / "a.json", "--communicator", *chosen)
+        assert command(assist, "--posterior", tmp_path, *SMALL, *out) == 0
+        results = json.loads((tmp_path / "a.json").read_text())
+        assert results["unexplained"] == ["person-01"]
+        nets = {name: one["net_by_person"] for name, one in results["communicators"].items()}
+        return nets, capsys.readouterr().err
+
+    found, error = played("mirror", "none")
+    assert said in error and "no messages are planned for them" in error
+    anyway, error = played("mirror", "--plan-anyway")
+    assert said in error and "may do harm" in error
+    assert found["mirror"][0] == found["none"][0] != anyway["mirror"][0]
+    assert found["mirror"][1] == anyway["mirror"][1]
+    _, error = played("none")  # a rule plans nothing
+    assert said not in error
+    assert command(assist, "--posterior", path, *SMALL, "--communicator", "mirror") == 0
+    assert said not in capsys.readouterr().err
