@@ -72,6 +72,12 @@ def as_whole_numbers(values: Tensor) -> Tensor:
     return bits + (bits >> 16)
 
 
+def joint_rows(values: Mapping[str, Tensor], none: Tensor) -> Tensor:
+    """Rows ``[M, N]`` of whole numbers, equal where all values ``[M, ...]`` are; or ``none``."""
+    rows = [as_whole_numbers(value).reshape(len(value), -1) for value in values.values()]
+    return torch.cat(rows, -1) if rows else none
+
+
 def uniform_of(seed: int, *names: Tensor) -> Tensor:
     """Uniform numbers ``[...]`` in 0 to 1 that are a function of whole numbers ``[...]``.
 

@@ -3,13 +3,13 @@
 import torch
 
 from mirror_ppl.likelihood.combinations import log_priors
-from mirror_ppl.likelihood.enumeration import combination_values, log_joints
+from mirror_ppl.likelihood.enumeration import log_joints
 
 
 def log_prior(human, table, policy):
     """Log prior probability ``[P, M]`` of each combination, given other sites ``[P, 1, ...]``."""
     draws = {name: value[None] for name, value in policy.items()}
-    return log_priors(human, combination_values(human, table), draws, table.people)[0]
+    return log_priors(human, table.grid, draws, table.people)[0]
 
 
 def log_joint(human, table, policy):

@@ -107,11 +107,11 @@ class HearingPerson(Person):
 
     def _take(self, hears: Mapping[str, Tensor]) -> None:
         self.draws = {**self.draws, **hears}
-        self._discrete = {
-            **self._discrete,
+        self._perceived = {
+            **self._perceived,
             **{name: value.flatten() for name, value in hears.items()},
         }
-        self.percepts, self.percept = self._distinct_percepts(self._discrete, self.number)
+        self.percepts, self.percept = self._distinct_percepts(self._perceived, self.number)
         self.percept_count = int(self.percept.max()) + 1
         self._log_likelihood = RunningSum()
 

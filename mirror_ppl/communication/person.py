@@ -1,8 +1,8 @@
 """The person in planning: posterior draws of a human model, tracked through a round.
 
 Beliefs depend on perceptual implants alone, and draws of these repeat; so beliefs are tracked once
-for each distinct *percept*, the values of the discrete sites (:class:`BeliefState`). U is the
-number of distinct percepts.
+for each distinct *percept*, the values of the sites that perception reads (:class:`BeliefState`).
+U is the number of distinct percepts.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ from mirror_ppl.communication.tracking import RunningSum, Tracks
 from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.attention import AttentionValues, Proposal
+from mirror_ppl.likelihood.combinations import perceived_names
 from mirror_ppl.likelihood.densities import choices, log_weighted_latents
 from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import HumanModel, require_standard_program
 from mirror_ppl.models.prior import checked_draws
 from mirror_ppl.randomness import forked, seed_everything
-from mirror_ppl.row_hashing import distinct_rows
+from mirror_ppl.row_hashing import distinct_rows, joint_rows
 
 COUNTED = 3
 """An item is dropped if an equivalent item costs no more, even as this number in a message."""
@@ -46,8 +47,8 @@ class Person:
         draws: values ``[S, 1, 1, ...]`` of all its sites, tensors or convertible to tensors.
 
     Attributes:
-        percepts: values ``[U]`` of the discrete sites, each combination in the draws once; in a
-            round including attention.
+        percepts: values ``[U, ...]`` of the sites that perception reads, each joint value in the
+            draws once; in a round including attention.
         percept: index of each draw's combination, ``[S]``.
 
     Raises:
@@ -64,15 +65,13 @@ class Person:
         self.number = len(next(iter(self.draws.values()), ()))
         if self.number == 0:
             raise HumanModelError("planning needs at least one posterior draw")
-        with torch.no_grad(), self._conditioned(), poutine.trace() as trace:
+        with torch.no_grad(), self._conditioned():
             self.implants = human.prior()
-        self._discrete = {
-            name: self.draws[name].reshape(self.number)
-            for name, site in trace.trace.nodes.items()
-            if name in self.draws and site["fn"].has_enumerate_support
-        }
+        with torch.no_grad():
+            read = perceived_names(human)
+        self._perceived = {name: self.draws[name][:, 0, 0] for name in read}
         self.device = next(iter(self.draws.values())).device
-        self.percepts, self.percept = self._distinct_percepts(self._discrete, self.number)
+        self.percepts, self.percept = self._distinct_percepts(self._perceived, self.number)
         self.percept_count = int(self.percept.max()) + 1
         self._tracks = Tracks()
         self._log_likelihood = RunningSum()
@@ -80,10 +79,9 @@ class Person:
     def _distinct_percepts(
         self, values: Mapping[str, Tensor], number: int
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """Return distinct combinations of values ``[number]``, and the index of each value."""
-        none = [torch.zeros(number, dtype=torch.long, device=self.device)]
-        rows = torch.stack([value.long() for value in values.values()] or none, -1)
-        first, which = distinct_rows(rows)
+        """Return distinct joint values ``[number, ...]``, and the index of each value."""
+        none = torch.zeros(number, 1, dtype=torch.long, device=self.device)
+        first, which = distinct_rows(joint_rows(values, none))
         return {name: value[first] for name, value in values.items()}, which
 
     @torch.no_grad()
@@ -104,7 +102,7 @@ class Person:
         own = {name: value[chosen] for name, value in values.items()}
         person = copy(self)
         person.percepts, person.percept = self._distinct_percepts(
-            {**self._discrete, **own}, self.number
+            {**self._perceived, **own}, self.number
         )
         person.percept_count = int(person.percept.max()) + 1
         return person
@@ -152,7 +150,7 @@ class Person:
             total = torch.zeros(self.number, number, device=self.device)
         everybody = copy(self)
         everybody.percepts = {
-            **{name: value.repeat_interleave(number) for name, value in self.percepts.items()},
+            **{name: value.repeat_interleave(number, 0) for name, value in self.percepts.items()},
             **{name: value.repeat(self.percept_count) for name, value in attention.items()},
         }
         everybody.percept_count = self.percept_count * number

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.models.belief_tracking import BeliefState, Transition
-from mirror_ppl.row_hashing import distinct_rows
+from mirror_ppl.row_hashing import distinct_rows, joint_rows
 
 TRACKS = 4
 """Number of tracks that are kept: of different rounds, or sets of percepts."""
@@ -24,7 +24,7 @@ class Track:
 
     Attributes:
         sites: names of the sites that make a percept.
-        percepts: their values ``[n, sites]``.
+        percepts: their values as whole numbers ``[n, N]``.
         past: the round so far.
         states: after each of its steps.
     """
@@ -40,7 +40,7 @@ class Track:
         return _begin_alike(self.past, past, steps, steps - 1)
 
     def of(self, percepts: Tensor) -> list[BeliefState] | None:
-        """Return the states of percepts ``[u, sites]``; None if some of them were not tracked."""
+        """Return the states of percepts ``[u, N]``; None if some of them were not tracked."""
         if torch.equal(percepts, self.percepts):
             return list(self.states)
         _, numbers = distinct_rows(torch.cat([self.percepts, percepts]))
@@ -75,14 +75,14 @@ class Tracks:
         """Return the states of percepts after each step of a round so far.
 
         Args:
-            percepts: values ``[n]`` by site.
+            percepts: values ``[n, ...]`` by site.
             past: the round so far.
             initial: state before it, of each percept.
             transitions: returns the transitions from a step on.
         """
         sites = sorted(percepts)
-        none = initial.belief.new_zeros(len(initial.belief))
-        rows = torch.stack([percepts[name].long() for name in sites] or [none], -1)
+        none = initial.belief.new_zeros(len(initial.belief), 1)
+        rows = joint_rows({name: percepts[name] for name in sites}, none)
         track, states = self._longest(sites, rows, past)
         further = transitions(len(states))
         if further:

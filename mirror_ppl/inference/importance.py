@@ -11,8 +11,10 @@ import torch
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.kinds import infer_kinds, models_by_kind
+from mirror_ppl.inference.point_proposals import with_points_near
 from mirror_ppl.inference.second_look import coarse, looks_twice, second_look
 from mirror_ppl.inference.weighted import Weighted
+from mirror_ppl.likelihood.combinations import needs_points
 from mirror_ppl.likelihood.densities import adds_to_prior
 from mirror_ppl.likelihood.tables import person_builders, rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
@@ -57,11 +59,17 @@ def infer_by_importance(
             if looks_twice(human):
                 rounds = rounds_of(job.rounds, person)
                 builder, own = second_look(human, rounds, job.screening, job.settings, builder, own)
+            elif needs_points(human):
+                rounds = rounds_of(job.rounds, person)
+                builder, own = with_points_near(
+                    builder, own, rounds, job.screening, job.settings
+                )
             draws = own.sample(job.draws, builder.grid)
             if job.rounds.measurements:
                 draws |= measured_draws(job.rounds.select_people([person]), job.draws)
             evidence = (own.log_evidence, own.evidence_error) if estimated else (nan, nan)
-            found.append((own.pareto_k, *evidence, engine, own.probable))
+            probable = own.probable if builder.grid.sizes is not None else None
+            found.append((own.pareto_k, *evidence, engine, probable))
             drawn.append(draws)
         order = sample_sites(job.human, 1)
     job.report("infer", people, people, "people")
@@ -69,7 +77,8 @@ def infer_by_importance(
     joined = {name: torch.cat([own.pop(name) for own in drawn], 1) for name in order}
     pareto_k, evidence, error, engines, combinations = zip(*found, strict=True)
     weighed = (torch.tensor(pareto_k), torch.tensor(evidence), torch.tensor(error))
-    return Inferred(joined, *weighed, combinations, engines=engines)
+    known = tuple(own for own in combinations if own is not None)
+    return Inferred(joined, *weighed, known, engines=engines)
 
 
 def has_evidence(human: HumanModel) -> bool:

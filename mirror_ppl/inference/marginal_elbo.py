@@ -20,7 +20,6 @@ from torch import Tensor
 
 from mirror_ppl.likelihood.compiled import Compiled, ViewTables
 from mirror_ppl.likelihood.densities import PLATES
-from mirror_ppl.likelihood.enumeration import combination_values
 
 
 class MarginalELBO(ELBO):
@@ -33,7 +32,7 @@ class MarginalELBO(ELBO):
     def __init__(self, compiled: ViewTables) -> None:
         super().__init__(max_plate_nesting=PLATES)
         self.compiled = compiled
-        self._values = combination_values(compiled.human, compiled.table)
+        self._values = compiled.table.grid
 
     def _get_trace(self, *_: Any) -> Any:
         """Unused: the loss takes one draw of the guide, and all combinations at once."""

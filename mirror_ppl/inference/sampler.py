@@ -27,10 +27,8 @@ from mirror_ppl.inference.pareto import pareto_smoothed
 from mirror_ppl.inference.residual_proposal import SITE, ResidualProposal
 from mirror_ppl.inference.weighted import Weighted
 from mirror_ppl.likelihood.combination_sets import EquivalentCombinations, fixed_prior
-from mirror_ppl.likelihood.combinations import discrete_sites
 from mirror_ppl.likelihood.densities import log_correction
 from mirror_ppl.likelihood.enumeration import (
-    combination_values,
     expected_counts,
     log_joints,
     require_acting_on_beliefs,
@@ -128,11 +126,10 @@ class Sampler:
             require_acting_on_beliefs(human, table.sites)
         self.human = human
         self.table = table
-        self.sites = scalar_sites(human) if sites is None else sites
+        every = scalar_sites(human) if sites is None else sites
+        self.sites = {name: site for name, site in every.items() if name not in table.sites}
         if combinations is None:
-            combinations = EquivalentCombinations.of(
-                table, fixed_prior(human, combination_values(human, table))
-            )
+            combinations = EquivalentCombinations.of(table, fixed_prior(human, table.grid))
         self.combinations = combinations
         self.place = torch.zeros(0, len(self.sites), device=table.index.device)
         self.supports = _policy_supports(human, table)
@@ -142,8 +139,6 @@ class Sampler:
         self._joints: list[Tensor] = []
         self._log_prior = torch.zeros(2, 0, device=table.index.device)  # of scalars, of discrete
         self._corrections: list[Tensor] = []
-        discrete = discrete_sites(human)
-        self._perceived = {site: discrete[site] for site in table.sites}
         self._residual: ResidualProposal | None = None
         self._log_residual = torch.zeros(2, 0, device=table.index.device)
 
@@ -176,7 +171,7 @@ class Sampler:
         likely = {s: own for s, own in self.table.likely.items() if s not in self.table.sites}
         if likely:
             number = len(next(iter(likely.values())))
-            added = log_correction(self.human, self._perceived, likely, 1)[:, 0].expand(number)
+            added = log_correction(self.human, self.table.grid, likely, 1)[:, 0].expand(number)
             every = torch.cat([joint, self._joint(likely, number)])
             keep |= within(self.human, every + torch.cat([said, added])[:, None], margin)
         if self.combinations.fixed:
@@ -280,7 +275,7 @@ class Sampler:
     ) -> None:
         self._policies.append(policy)
         self._joints.append(joint)
-        found = log_correction(self.human, self._perceived, policy, 1)[:, 0]
+        found = log_correction(self.human, self.table.grid, policy, 1)[:, 0]
         self._corrections.append(found.expand(len(joint)))
         self.place = torch.cat([self.place, place])
         groups = []

@@ -33,7 +33,6 @@ from mirror_ppl.inference.marginal_elbo import elbo_of
 from mirror_ppl.likelihood.combinations import log_priors
 from mirror_ppl.likelihood.compiled import Compiled, ViewTables
 from mirror_ppl.likelihood.densities import PLATES
-from mirror_ppl.likelihood.enumeration import combination_values
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import combination_scores
 from mirror_ppl.likelihood.view_table import NO_VIEW
@@ -230,13 +229,12 @@ def _prune(compiled: ViewTables, guide: Callable[[], Draws], margin: float) -> N
     Each is scored under its best draw of the guide.
     """
     human, table = compiled.human, compiled.table
-    grid = combination_values(human, table)
     best, spared = torch.tensor(-torch.inf), torch.tensor(False)
     for _ in range(PRUNING_DRAWS):
         drawn = guide()
         one = {name: value[None] for name, value in drawn.items()}
         try:
-            prior = log_priors(human, grid, one, table.people)
+            prior = log_priors(human, table.grid, one, table.people)
         except HumanModelError:
             return  # other sites depend on these, so no combination has a prior
         with (

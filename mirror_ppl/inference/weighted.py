@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -33,6 +34,7 @@ class Weighted:
         pareto_k: Pareto k of the weights.
         log_evidence: estimated log marginal likelihood of the recorded actions, nats.
         proposed_residual: True if the residual was proposed by its Laplace approximation.
+        points: effective number of points (:mod:`mirror_ppl.likelihood.points`), if there are any.
     """
 
     policy: Draws
@@ -42,6 +44,7 @@ class Weighted:
     pareto_k: float
     log_evidence: float
     proposed_residual: bool = False
+    points: float = math.inf
 
     @property
     def effective(self) -> float:
@@ -51,14 +54,29 @@ class Weighted:
     @property
     def evidence_error(self) -> float:
         """Approximate standard error of ``log_evidence``, nats."""
-        return max(1 / self.effective - 1 / len(self.log_weights), 0.0) ** 0.5
+        of_draws = max(1 / self.effective - 1 / len(self.log_weights), 0.0)
+        return (of_draws + 1 / self.points) ** 0.5
+
+    @property
+    def _of_sets(self) -> Tensor:
+        """Posterior probability of each set of combinations ``[G]``."""
+        counts = self.log_weights > -torch.inf
+        given = torch.softmax(self.log_joint[counts].double(), -1)
+        return self.log_weights[counts].double().exp() @ given
+
+    def combination_probabilities(self) -> tuple[Tensor, Tensor]:
+        """Numbers of the possible combinations ``[C]``, and their posterior probabilities."""
+        sets = self.combinations
+        chance = sets.share.double().diff(prepend=sets.share.new_zeros(1).double())
+        which = torch.arange(len(sets), device=chance.device).repeat_interleave(sets.sizes)
+        total = torch.zeros_like(self._of_sets).index_add(0, which, chance)
+        found = (self._of_sets / total)[which] * chance
+        return sets.members, found / found.sum()
 
     @property
     def probable(self) -> Tensor:
         """The combinations that together have all but `NEGLIGIBLE` of the probability, sorted."""
-        counts = self.log_weights > -torch.inf
-        given = torch.softmax(self.log_joint[counts].double(), -1)
-        probability = self.log_weights[counts].double().exp() @ given  # [G]
+        probability = self._of_sets
         best, order = probability.sort(descending=True)
         kept = torch.zeros_like(order, dtype=torch.bool)
         kept[order] = best.cumsum(0) - best < 1 - NEGLIGIBLE
@@ -87,7 +105,7 @@ class Weighted:
 
         Args:
             number: number of draws.
-            values: values of the discrete sites for every combination, ``[M]``.
+            values: values of the sites that perception reads, for every combination ``[M, ...]``.
         """
         # Systematic resampling in random order repeats draws as little as possible.
         ladder = (torch.arange(number) + torch.rand(())) / number
@@ -97,8 +115,6 @@ class Weighted:
         distinct, which = place.unique(return_inverse=True)
         ladder = torch.softmax(self.log_joint[distinct].double(), -1).cumsum(-1)[which]
         chosen = torch.searchsorted(ladder, ladder[:, -1:] * torch.rand_like(ladder[:, :1]))
-        combination = self.combinations.draw(chosen.clamp(max=ladder.shape[-1] - 1).squeeze(-1))[
-            :, None
-        ]
-        discrete = {site: value[combination][..., None] for site, value in values.items()}
-        return {name: value[place] for name, value in self.policy.items()} | discrete
+        drawn = self.combinations.draw(chosen.clamp(max=ladder.shape[-1] - 1).squeeze(-1))
+        perceived = {site: value[drawn][:, None, None] for site, value in values.items()}
+        return {name: value[place] for name, value in self.policy.items()} | perceived

@@ -19,7 +19,7 @@ from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.combination_sets import fixed_prior
-from mirror_ppl.likelihood.combinations import log_priors, perceived_sites
+from mirror_ppl.likelihood.combinations import log_priors, needs_points, perceived_names
 from mirror_ppl.likelihood.densities import (
     Given,
     choices,
@@ -29,6 +29,7 @@ from mirror_ppl.likelihood.densities import (
     prior_nodes,
 )
 from mirror_ppl.likelihood.enumeration import conditioned
+from mirror_ppl.likelihood.points import PriorPoints
 from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel, at_step, messages_at, recorded_covariates
@@ -122,7 +123,7 @@ def unused_sites(human: HumanModel) -> list[str]:
     on others are left out: these can be measured.
     """
     found = dependencies(human)
-    used = frozenset(perceived_sites(human)).union(
+    used = frozenset(perceived_names(human)).union(
         found.actions, *found.prior.values(), *found.round_latents.values()
     )
     draws = draw_prior(human, 2, COMPARED, SEED)
@@ -246,11 +247,13 @@ def _put_together(
     latents: Mapping[str, Tensor],
 ) -> Tensor:
     """Log densities ``[S]`` of the rounds and draws, combined as engines do."""
-    read = perceived_sites(human)
     number, every = DRAWS, torch.arange(DRAWS, device=rounds.actions.device)
-    policy = {name: value for name, value in draws.items() if name not in read}
-    grid = {name: draws[name].flatten() for name in read}
-    total = log_correction(human, read, policy, 1)[:, 0].expand(number)
+    names = set(perceived_names(human))
+    if needs_points(human):
+        names = set(PriorPoints.of(human).sites)
+    policy = {name: value for name, value in draws.items() if name not in names}
+    grid = {name: draws[name][:, 0, 0] for name in draws if name in names}
+    total = log_correction(human, grid, policy, 1)[:, 0].expand(number)
     for name, node in prior_nodes(human, draws, number, 1).items():
         if name in policy:
             total = total + node["fn"].log_prob(node["value"]).reshape(-1).expand(number)
@@ -284,7 +287,7 @@ def _beliefs(
 ) -> list[BeliefState]:
     """Beliefs after each step under each draw in each round, ``[S B]``."""
     number, count = DRAWS, rounds.shape[1]
-    implants = {name: value.repeat_interleave(count) for name, value in grid.items()}
+    implants = {name: value.repeat_interleave(count, 0) for name, value in grid.items()}
     implants |= {name: value.flatten() for name, value in latents.items()}
     row = torch.arange(count, device=rounds.actions.device).repeat(number)
     observation = {name: value[0] for name, value in rounds.observation().items()}

@@ -1,4 +1,4 @@
-"""Combinations of the discrete implants that perception reads, and their prior."""
+"""The sites that perception reads, and the prior of their joint values."""
 
 from __future__ import annotations
 
@@ -22,15 +22,18 @@ from mirror_ppl.likelihood.densities import (
     log_prob,
     prior_nodes,
 )
+from mirror_ppl.likelihood.grid import Grid
 from mirror_ppl.models.dependencies import Sites, dependencies
 from mirror_ppl.models.dependencies import forget as forget_dependencies
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites
 from mirror_ppl.randomness import forked
 from mirror_ppl.user_code import is_of_package
 
 MAX_COMBINATIONS = 100_000
+"""Largest number of combinations that are all summed over."""
 
 
 def discrete_sites(human: HumanModel) -> dict[str, Tensor]:
@@ -50,7 +53,7 @@ def require_own_attention(human: HumanModel, sites: Iterable[str]) -> None:
 
     Args:
         human: the model of people.
-        sites: names of the discrete sites that ``perceive`` reads.
+        sites: names of the sites that ``perceive`` reads.
 
     Raises:
         HumanModelError: a round latent depends on one of the sites.
@@ -58,8 +61,8 @@ def require_own_attention(human: HumanModel, sites: Iterable[str]) -> None:
     for name, parents in dependencies(human).round_latents.items():
         if parents & set(sites):
             raise HumanModelError(
-                f'"{name}" of round_latents depends on a discrete site that perceive() reads; let '
-                "it depend on others only"
+                f'"{name}" of round_latents depends on a site that perceive() reads; let it depend '
+                "on others only"
             )
 
 
@@ -67,60 +70,72 @@ def perceived_sites(human: HumanModel) -> dict[str, Tensor]:
     """Supports ``[n]`` of the discrete sites that ``perceive`` reads, in the program's order.
 
     Raises:
-        HumanModelError: ``perceive`` reads a site that cannot be enumerated, one whose values are
-            not 0, 1 and so on, or there are too many combinations of values.
+        HumanModelError: ``perceive`` reads a site whose values are not 0, 1 and so on.
     """
-    supports = discrete_sites(human)
-    others = unread_sites(human, supports)
-    supports = {name: support for name, support in supports.items() if name not in others}
+    read = perceived_names(human)
+    supports = {name: own for name, own in discrete_sites(human).items() if name in read}
     for name, support in supports.items():
         if not torch.equal(support.long(), torch.arange(len(support), device=support.device)):
             raise HumanModelError(
                 f'perceive() reads "{name}", whose values are not 0, 1 and so on; sample a place '
                 "in a list of its values"
             )
-    number = prod(len(support) for support in supports.values())
-    if number > MAX_COMBINATIONS:
-        raise HumanModelError(
-            f"perceive() depends on {number} combinations of discrete values; "
-            f"at most {MAX_COMBINATIONS} can be marginalized"
-        )
     return supports
 
 
-_unread: WeakKeyDictionary[HumanModel, tuple[Sites, Sites]] = WeakKeyDictionary()
+def needs_points(human: HumanModel) -> bool:
+    """True if there are too many joint values of the sites that perception reads to sum over all.
+
+    One of these is continuous, or they have more than :data:`MAX_COMBINATIONS` combinations.
+    """
+    supports = perceived_sites(human)
+    number = prod(len(support) for support in supports.values())
+    return bool(set(perceived_names(human)) - supports.keys()) or number > MAX_COMBINATIONS
+
+
+_read_by: WeakKeyDictionary[HumanModel, tuple[tuple[str, ...], Sites]] = WeakKeyDictionary()
 
 
 def forget(human: HumanModel) -> None:
     """Drop what was found out about a human model, which may have been changed since."""
-    _unread.pop(human, None)
+    _read_by.pop(human, None)
     forget_dependencies(human)
     vars(human).pop("has_round_latents", None)
 
 
-def unread_sites(human: HumanModel, supports: Mapping[str, Tensor] | None = None) -> Sites:
-    """Discrete sites of the prior that ``perceive`` does not read in some trial rounds.
+def perceived_names(human: HumanModel) -> tuple[str, ...]:
+    """Names of the sites of the prior that ``perceive`` reads, in the program's order."""
+    return _trial(human)[0]
+
+
+def unread_sites(human: HumanModel) -> Sites:
+    """Sites of the prior that ``perceive`` does not read in some trial rounds."""
+    known = _read_by.get(human)
+    return _trial(human)[1] if known is None else known[1]
+
+
+def _trial(human: HumanModel) -> tuple[tuple[str, ...], Sites]:
+    """Sites that perception reads, and others; found once for each set of sites."""
+    values = {name: value[0, 0] for name, value in draw_prior(human, 1, 1, 0).items()}
+    known = _read_by.get(human)
+    if known is None or {*known[0], *known[1]} != values.keys():
+        read = _read(human, values)
+        names = tuple(name for name in values if name in read)
+        known = _read_by[human] = names, frozenset(values) - read
+    return known
+
+
+def _read(human: HumanModel, values: Mapping[str, Tensor]) -> set[str]:
+    """Sites that ``perceive`` reads in a round without messages or with all messages.
 
     Args:
         human: the model of people.
-        supports: supports of all discrete sites; by default those of the last call.
-
-    Raises:
-        HumanModelError: ``perceive`` reads a site that cannot be enumerated.
+        values: of the sites of its prior, ``[1, ...]``.
     """
-    known = _unread.get(human)
-    if known is None or (supports is not None and known[0] != frozenset(supports)):
-        supports = discrete_sites(human) if supports is None else supports
-        names = frozenset(supports)
-        known = _unread[human] = names, names - _read(human, supports)
-    return known[1]
-
-
-def _read(human: HumanModel, supports: Mapping[str, Tensor]) -> set[str]:
-    """Sites that ``perceive`` reads in a round without messages or with all messages."""
     domain, device = human.domain, next(human.parameters()).device
-    sites = {**supports, **attention_sites(human)}
-    implants = Readable({name: support[:1] for name, support in sites.items()})
+    attention = {name: support[:1] for name, support in attention_sites(human).items()}
+    implants = Readable({**values, **attention})
+    enumerated = {*discrete_sites(human), *attention}
     state = domain.initial(1, torch.Generator(device).manual_seed(0))
     without: Any = human.nothing_known(1, device=device)
     informed: Any = without
@@ -131,8 +146,8 @@ def _read(human: HumanModel, supports: Mapping[str, Tensor]) -> set[str]:
             silence = {name: torch.zeros_like(mask) for name, mask in told.items()}
             _, without = human.perceive(implants, without, now, silence, step)
             _, informed = human.perceive(implants, informed, now, told, step)
-            if implants.read >= sites.keys() and is_of_package(human):
-                break  # there is no other; a user's model may read what cannot be enumerated
+            if implants.read >= enumerated and is_of_package(human):
+                break  # the package's models read the same sites at every step
             action = torch.full((1,), step % len(domain.actions), device=device)
             state = domain.transition(state, action)
     return implants.read
@@ -144,7 +159,7 @@ def require_unread(human: HumanModel, names: Iterable[str]) -> None:
     Raises:
         InputError: ``perceive`` reads one of these.
     """
-    read = perceived_sites(human)
+    read = perceived_names(human)
     for name in names:
         if name in read:
             raise InputError(
@@ -153,49 +168,72 @@ def require_unread(human: HumanModel, names: Iterable[str]) -> None:
             )
 
 
-def grid_of(supports: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Values ``[M]`` of sites for each of their M combinations, row-major."""
-    if not supports:
-        return {}
-    # A grid of indices, since supports may have different dtypes.
-    places = [torch.arange(len(support), device=support.device) for support in supports.values()]
-    axes = torch.meshgrid(*places, indexing="ij")
-    return {
-        site: support[axis.flatten()]
-        for (site, support), axis in zip(supports.items(), axes, strict=True)
-    }
-
-
 @torch.no_grad()
 def log_priors(
-    human: HumanModel, grid: Mapping[str, Tensor], draws: Mapping[str, Tensor], people: int
+    human: HumanModel,
+    grid: Mapping[str, Tensor],
+    draws: Mapping[str, Tensor],
+    people: int,
 ) -> Tensor:
-    """Log prior probability ``[S, P, M]`` of each combination.
+    """Log prior probability ``[S, P, M]`` of each combination, relative to that of a `Grid`.
 
     Includes factors, observed sites, scales and masks of ``prior`` that depend on these sites; the
     rest is :func:`mirror_ppl.likelihood.densities.log_correction`.
 
     Args:
         human: the model of people.
-        grid: values ``[M]`` of the discrete sites.
+        grid: values ``[M, ...]`` of the sites that perception reads.
         draws: values of all other sites ``[S, P, 1, ...]``, on which the prior may depend.
         people: number of people P.
 
     Raises:
         HumanModelError: the prior of another site depends on these.
     """
+    found = _log_priors(human, grid, draws, people, corrections=True)
+    if isinstance(grid, Grid) and grid.log_proposal is not None:
+        return found - grid.log_proposal
+    return found
+
+
+@torch.no_grad()
+def log_sampled(
+    human: HumanModel, grid: Mapping[str, Tensor], draws: Mapping[str, Tensor]
+) -> Tensor:
+    """Log density ``[S, M]`` with which ``prior`` samples values ``[M, ...]`` of some sites.
+
+    Args:
+        human: the model of people.
+        grid: the values.
+        draws: values of all other sites ``[S, 1, 1, ...]``.
+    """
+    return _log_priors(human, grid, draws, 1, corrections=False)[:, 0]
+
+
+def _log_priors(
+    human: HumanModel,
+    grid: Mapping[str, Tensor],
+    draws: Mapping[str, Tensor],
+    people: int,
+    *,
+    corrections: bool,
+) -> Tensor:
+    """Log prior ``[S, P, M]`` of values; with ``corrections`` also what else depends on them."""
     values = {site: value[:, None, None, None] for site, value in grid.items()}
     number = len(next(iter(draws.values()))) if draws else 1
     nodes = prior_nodes(human, {**draws, **values}, number, people)
     total = next(human.parameters()).new_zeros(1, 1, 1, 1)
     for name, node in nodes.items():
-        if name in grid:
+        if name in grid and corrections:
             own = _log_prior(node, grid[name])
+        elif name in grid:
+            own = node["fn"].log_prob(node["value"])
+        elif not corrections:
+            continue
         elif not is_observed(node) and len(node["fn"].batch_shape) > BATCH:
             raise HumanModelError(
-                f'the prior of "{name}" depends on a discrete site that perceive() reads; let that '
-                f'site depend on "{name}" instead, or override model(), if only to call '
-                "super().model(rounds, world), for the engines svi and nuts"
+                f'the prior of "{name}" depends on a site that perceive() reads; let that site '
+                f'depend on "{name}" instead, or, if it is discrete, override model(), if only to '
+                "call super().model(rounds, world), for the engines svi and nuts"
             )
         else:  # scales and masks may depend on these sites where the density does not
             own = correction(node)
@@ -211,8 +249,8 @@ def _log_prior(node: Any, value: Tensor) -> Tensor:
     """Log-probability ``[M, S, P, 1]`` of values ``[M]``; S may be 1 if draws do not differ."""
     fn = node["fn"]
     plain = node["mask"] is None and isinstance(node["scale"], (int, float))
-    if len(fn.batch_shape) > BATCH or not plain:  # may depend on other discrete sites
-        return log_prob(node)
+    if value.is_floating_point() or len(fn.batch_shape) > BATCH or not plain:
+        return log_prob(node)  # may depend on other sites, or has hardly a value twice
     # The prior of most sites depends on no other site, so that it is one table.
     values, index = value.unique(return_inverse=True)
     table = fn.log_prob(values[:, None, None, None])

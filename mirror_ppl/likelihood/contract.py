@@ -20,7 +20,8 @@ from mirror_ppl.domains import Domain
 from mirror_ppl.domains.record import require_power
 from mirror_ppl.errors import HumanModelError, MirrorError, UnreadSite
 from mirror_ppl.likelihood.agreement import check_agreement, unused_sites
-from mirror_ppl.likelihood.combinations import forget
+from mirror_ppl.likelihood.combinations import forget, needs_points
+from mirror_ppl.likelihood.points import PriorPoints
 from mirror_ppl.likelihood.site_contract import (
     check_names,
     check_sight,
@@ -31,7 +32,7 @@ from mirror_ppl.likelihood.site_contract import (
 from mirror_ppl.likelihood.span_contract import check_spans_hold
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel, Implants, has_own_program, overrides
-from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
+from mirror_ppl.models.sites import Readable, latent_sites, latent_values
 from mirror_ppl.models.view import View
 from mirror_ppl.randomness import forked, seed_everything
 from mirror_ppl.shapes import broadcast_shapes
@@ -93,19 +94,15 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
             latents = _round_latents(human, _Returned(implants), people)
             for name in set(latents) & set(latent_sites(trace.trace)):
                 raise HumanModelError(f'"{name}" is a site of prior() and of round_latents()')
-            sampled = latent_values(trace.trace)
-            discrete = {
-                name: sampled[name].flatten()[:people].expand(people)
-                for name in sampled
-                if name in discrete_names(trace.trace)
-            }
+            own = {name: value[:, 0] for name, value in latent_values(trace.trace).items()}
+            sites = {name: value.expand(people, *value.shape[1:]) for name, value in own.items()}
             belief = next(human.parameters()).new_zeros(people, human.belief_size)
             method = "nothing_known"
             knowledge: Any = human.nothing_known(people, device=device)
             _check_knowledge("nothing_known returned {}", knowledge, (people,))
             for step, now in enumerate(observed):
                 with WithoutSites(BELIEVING):
-                    readable = Readable(discrete | latents, implants.keys())
+                    readable = Readable(sites | latents, implants.keys())
                     if overrides(human, "sees"):
                         method = "sees"
                         _check_sees(domain, human.sees(readable, now, step), people)
@@ -130,9 +127,11 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                 _check_act(human, _Returned(implants), belief)
         refuse_parameters(trace.trace)
         check_names(domain, [*latent_sites(trace.trace), *latents])
+        if needs_points(human):
+            PriorPoints.of(human)
         method = "spans"
         if human.chained:
-            check_spans_hold(human, {name: value[:1] for name, value in discrete.items()})
+            check_spans_hold(human, {name: value[:1] for name, value in sites.items()})
         unused: list[str] = []
         if not has_own_program(human):
             method = "model"

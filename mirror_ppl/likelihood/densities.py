@@ -81,17 +81,17 @@ def log_correction(
 ) -> Tensor:
     """Log density ``[S, P]`` that ``prior`` adds to that of sampling its draws.
 
-    Sums its factors, observed sites, scales and masks. Those that depend on the discrete sites that
+    Sums its factors, observed sites, scales and masks. Those that depend on the sites that
     perception reads are excluded; they are part of
     :func:`~mirror_ppl.likelihood.combinations.log_priors`.
 
     Args:
         human: the model of people.
-        sites: supports ``[n]`` of these discrete sites.
+        sites: values ``[n, ...]`` of these sites, of which the first and the last are tried.
         draws: values of all other sites ``[S, P, 1, ...]``.
         people: number of people P.
     """
-    two = {site: support[[0, -1]].view(2, 1, 1, 1) for site, support in sites.items()}
+    two = {site: value[[0, -1]][:, None, None, None] for site, value in sites.items()}
     number = len(next(iter(draws.values()))) if draws else 1
     total = next(human.parameters()).new_zeros(number, people, 1)
     for name, node in prior_nodes(human, {**draws, **two}, number, people).items():

@@ -15,7 +15,7 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.likelihood.combinations import discrete_sites, grid_of, log_priors
+from mirror_ppl.likelihood.combinations import log_priors
 from mirror_ppl.likelihood.densities import choices
 from mirror_ppl.likelihood.table_program import log_likelihoods, of_moments
 from mirror_ppl.likelihood.tables import combination_scores
@@ -28,12 +28,6 @@ CHUNK = 2**19
 """Views and moments, summed over draws, that are computed at once: what a cache holds."""
 IMPROBABLE = -1e4
 """Log-probability that stands for 0 where gradients are taken."""
-
-
-def combination_values(human: HumanModel, table: ViewTable) -> dict[str, Tensor]:
-    """Values ``[M]`` of the discrete sites of a table, for each of their M combinations."""
-    supports = discrete_sites(human)
-    return grid_of({site: supports[site] for site in table.sites})
 
 
 @torch.no_grad()
@@ -56,11 +50,9 @@ def log_joints(
         log_prior: log prior ``[M]`` of these, which replaces the model's.
     """
     number = len(next(iter(draws.values()))) if draws else 1
-    grid = {}
-    if log_prior is None:
-        grid = combination_values(human, table)
-    if combinations is not None:
-        grid = {site: value[combinations] for site, value in grid.items()}
+    grid = table.grid
+    if combinations is not None and log_prior is None:
+        grid = grid.chosen(combinations)
     size = max(1, CHUNK // (table.moments.shape[:2].numel() + table.acted.numel()))
     parts = []
     for begin in range(0, number, size):
@@ -110,7 +102,7 @@ def expected_counts(
         log_prior: log prior of these ``[G]``, if it does not depend on the other sites.
     """
     number = len(log_weights)
-    grid = {name: one[combinations] for name, one in combination_values(human, table).items()}
+    grid = table.grid.chosen(combinations)
     with conditioned(draws, number, 1), torch.enable_grad():
         implants = human.prior()
         with torch.no_grad():
@@ -164,5 +156,5 @@ def draw_combinations(
     """Draw ``[S, P, 1]`` values of the table's sites by log weights ``[P, M]``."""
     chosen = torch.multinomial(torch.softmax(log_weights, -1), number, replacement=True).T
     return {
-        site: value[chosen][..., None] for site, value in combination_values(human, table).items()
+        site: value[chosen[..., None]] for site, value in table.grid.items()
     }

@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.likelihood.attention import VALUES
 from mirror_ppl.likelihood.chain import Chain
+from mirror_ppl.likelihood.grid import Grid
 from mirror_ppl.likelihood.round_views import Rounds, RoundViews
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.view_table import IMPOSSIBLE, NO_VIEW, Attention, ViewTable
@@ -130,6 +131,7 @@ def build_view_table(
     report: Callable[[int], None] = lambda people: None,
     likely: Mapping[str, Tensor] | None = None,
     values: int = VALUES,
+    grid: Grid | None = None,
 ) -> ViewTable:
     """Build the table of all distinct views of recorded rounds, with their beliefs.
 
@@ -142,12 +144,15 @@ def build_view_table(
         report: called with the number of people done.
         likely: approximate posterior draws ``[S, P, 1, ...]``, see :class:`ViewTableBuilder`.
         values: number of sampled values of attention per round.
+        grid: joint values of the sites that perception reads, see :class:`ViewTableBuilder`;
+            points are of one person.
 
     Raises:
-        HumanModelError: ``perceive`` reads a site that cannot be enumerated, or there are too many
-            combinations of values.
+        HumanModelError: the model breaks its contract.
     """
-    builders = person_builders(human, demonstrations, screening, likely, candidates, values, report)
+    builders = person_builders(
+        human, demonstrations, screening, likely, candidates, values, report, grid
+    )
     return join_tables([builder.table() for builder in builders], demonstrations.shape)
 
 
@@ -159,6 +164,7 @@ def person_builders(
     candidates: Sequence[Tensor] | None = None,
     values: int = VALUES,
     report: Callable[[int], None] = lambda people: None,
+    grid: Grid | None = None,
 ) -> Iterator[ViewTableBuilder]:
     """Yield a builder with the rounds of each person in turn; see `build_view_table`.
 
@@ -172,7 +178,7 @@ def person_builders(
         if demonstrations.measurements:
             alone = with_measurements(human, demonstrations.select_people([person]))
         some = None if candidates is None else candidates[person]
-        builder = ViewTableBuilder(alone, screening, some, own, values)
+        builder = ViewTableBuilder(alone, screening, some, own, values, grid)
         builder.add(rounds_of(demonstrations, person))
         yield builder
         report(person + 1)
@@ -224,8 +230,7 @@ def join_tables(
             **_padded_sights(views),
         )
     return ViewTable(
-        sites=tables[0].sites,
-        sizes=tables[0].sizes,
+        grid=tables[0].grid,
         index=torch.stack([_pad(table.index[0], rounds, NO_VIEW) for table in tables]),
         **_padded(views),
         recorded=torch.stack([recorded(table.recorded[0]) for table in tables]),

@@ -20,6 +20,7 @@ from torch.nn.functional import pad
 from mirror_ppl.likelihood.attention import AttentionValues
 from mirror_ppl.likelihood.chain import Chain
 from mirror_ppl.likelihood.densities import log_weighted_latents
+from mirror_ppl.likelihood.grid import Grid
 from mirror_ppl.likelihood.sums import Sums
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.shapes import broadcast_shapes
@@ -28,15 +29,6 @@ NO_VIEW = -1
 """Index of a combination of implants that was dropped."""
 IMPOSSIBLE = -1e6
 """Log-likelihood in nats of such a combination; finite, so that gradients are finite."""
-
-
-def combination_number(implants: Implants, sizes: Mapping[str, int]) -> Tensor:
-    """Number of the combination of implants ``[...]``, row-major over these sites."""
-    number = torch.zeros((), dtype=torch.long)
-    for site, size in sizes.items():
-        value = implants[site].long()
-        number = number.to(value.device) * size + value
-    return number
 
 
 @dataclass(frozen=True)
@@ -123,11 +115,9 @@ class ViewTable:
     Views share the N moments that they have in common.
 
     Attributes:
-        sites: names of the discrete sites that views depend on.
-        sizes: number of values of each of those sites.
-        index: sight of each person, round and combination of those sites' values, ``[P, B, M]``,
-            an index into the person's U sights or ``NO_VIEW``. Without round latents a sight is a
-            view, and U is V.
+        grid: the M joint values of the sites that views depend on; points are of one person.
+        index: sight of each person, round and joint value, ``[P, B, M]``, an index into the
+            person's U sights or ``NO_VIEW``. Without round latents a sight is a view, and U is V.
         moments: number of the moment at each step of a view, ``[P, V, T]``; ``NO_VIEW`` in
             padding.
         belief: ``[P, N, Z]``.
@@ -143,8 +133,7 @@ class ViewTable:
             probable (of a table of several people, none).
     """
 
-    sites: tuple[str, ...]
-    sizes: tuple[int, ...]
+    grid: Grid
     index: Tensor
     moments: Tensor
     belief: Tensor
@@ -159,6 +148,16 @@ class ViewTable:
     @cached_property
     def _steps_of_views(self) -> Sums:
         return Sums.of(self.moments, self.moments != NO_VIEW, self.acted.shape[-1])
+
+    @property
+    def sites(self) -> tuple[str, ...]:
+        """Names of the sites that views depend on."""
+        return tuple(self.grid)
+
+    @property
+    def sizes(self) -> tuple[int, ...] | None:
+        """Number of values of each of these; None for points."""
+        return self.grid.sizes
 
     @property
     def people(self) -> int:
@@ -221,8 +220,8 @@ class ViewTable:
         return torch.where(self.real[..., None], found, 0.0).sum(-2)
 
     def combination(self, implants: Implants) -> Tensor:
-        """Number of the combination of implants ``[...]``, row-major over ``sizes``."""
-        return combination_number(implants, dict(zip(self.sites, self.sizes, strict=True)))
+        """Number of the joint value of implants ``[...]``."""
+        return self.grid.place_of(implants)
 
     def along_views(self, moments: Tensor) -> Tensor:
         """Log-likelihood ``[..., P, V]`` of views, given that of moments ``[..., P, N]``."""

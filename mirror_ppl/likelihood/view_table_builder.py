@@ -1,6 +1,6 @@
 """Builder of the table of views of one person's rounds.
 
-Every combination of the discrete implants is a candidate. After some rounds, candidates are dropped
+Every combination of what perception reads (:mod:`mirror_ppl.likelihood.grid`) is a candidate. After some rounds, candidates are dropped
 whose likelihood is far below the best one's under every policy. Later rounds need no views of them,
 and exact marginalization stays cheap. A candidate is kept if recorded actions are impossible under
 it and some policy: with other policies it may be the most probable one. It is also kept if it is
@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
-from math import prod
 
 import torch
 from torch import Tensor
@@ -22,14 +21,11 @@ from mirror_ppl.likelihood.attention import KEPT, VALUES, AttentionValues, Propo
 from mirror_ppl.likelihood.chain import NEVER, Chain
 from mirror_ppl.likelihood.chained_views import chained_views
 from mirror_ppl.likelihood.combination_sets import fixed_prior
-from mirror_ppl.likelihood.combinations import (
-    grid_of,
-    log_priors,
-    perceived_sites,
-    require_own_attention,
-)
+from mirror_ppl.likelihood.combinations import log_priors, require_own_attention
 from mirror_ppl.likelihood.densities import require_compilable
+from mirror_ppl.likelihood.grid import Grid
 from mirror_ppl.likelihood.likely_policies import LikelyPolicies
+from mirror_ppl.likelihood.points import whole_grid
 from mirror_ppl.likelihood.policies import draw_policies, within
 from mirror_ppl.likelihood.policy_likelihoods import PolicyLikelihoods
 from mirror_ppl.likelihood.round_views import ManyViews, Rounds, RoundViews, views_of_rounds
@@ -42,7 +38,7 @@ from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.row_hashing import distinct_rows, seed_of
 
 SCREENED_ROWS, MOST_ROWS = 4096, 32768
-"""Combinations of discrete implants times rounds that are processed at once. With screening,
+"""Combinations times rounds that are processed at once. With screening,
 the number at which they take as long as the calls' overhead: later rounds have fewer left."""
 CHAINED_ROUNDS = 32
 """Rounds that are processed at once where attention is summed out exactly."""
@@ -66,13 +62,13 @@ class ViewTableBuilder:
         likely: approximate posterior draws ``[S, 1, 1, ...]`` of the person, from which attention
             is proposed; by default prior draws weighted by earlier rounds.
         values: number of sampled values of attention per round.
+        grid: joint values of the sites that perception reads; by default :func:`whole_grid`.
 
     Raises:
-        HumanModelError: see :func:`perceived_sites` and :func:`require_own_attention`.
+        HumanModelError: see :func:`whole_grid` and :func:`require_own_attention`.
 
     Attributes:
-        grid: values ``[M]`` of the discrete sites that perception reads, for each combination.
-        sizes: number of values of each of these sites.
+        grid: joint values ``[M, ...]`` of the sites that perception reads, or *combinations*.
         alive: numbers of the combinations that are left.
         score: log-likelihood ``[policies, M]`` of each combination under each policy.
         policies: these policies, see :func:`draw_policies`; ``likely``, if given.
@@ -85,15 +81,14 @@ class ViewTableBuilder:
         candidates: Tensor | None = None,
         likely: Mapping[str, Tensor] | None = None,
         values: int = VALUES,
+        grid: Grid | None = None,
     ) -> None:
         require_compilable(human)
         device = next(human.parameters()).device
         self.human = human
         self.screening = screening
-        supports = perceived_sites(human)
-        self.grid = grid_of(supports)
-        self.sizes = tuple(len(support) for support in supports.values())
-        self.alive = torch.arange(prod(self.sizes), device=device)
+        self.grid = whole_grid(human) if grid is None else grid
+        self.alive = torch.arange(self.grid.number, device=device)
         if candidates is not None:
             self.alive = candidates
         self.policies: dict[str, Tensor] = {}
@@ -108,7 +103,7 @@ class ViewTableBuilder:
         number = 0 if screening is None else screening.policies
         if self.policies:
             number = len(next(iter(self.policies.values())))
-        self.score = torch.zeros(number, prod(self.sizes), device=device)
+        self.score = torch.zeros(number, self.grid.number, device=device)
         self._likelihoods = PolicyLikelihoods(human, self.policies, number)
         self._rounds: list[RoundViews] = []
         self._seen: list[tuple[Tensor, Tensor]] = []
@@ -125,7 +120,7 @@ class ViewTableBuilder:
             assert screening is not None
             self._likely = LikelyPolicies(human, self.grid, screening.seed + 1)
         if human.has_round_latents:
-            require_own_attention(human, supports)
+            require_own_attention(human, self.grid)
         if human.has_round_latents and not human.chained:
             known = {} if likely is not None else self.policies
             anybody = known or draw_prior(human, 1, PROPOSING_POLICIES, 0)
@@ -164,7 +159,7 @@ class ViewTableBuilder:
         if self.screening is None or as_they_are or number <= FEW_ROUNDS:
             return None
         some = some_of(self.alive)
-        candidates = {name: axis[some].repeat(number) for name, axis in self.grid.items()}
+        candidates = {name: repeated(axis[some], number) for name, axis in self.grid.items()}
         row = torch.arange(number, device=some.device).repeat_interleave(len(some))
         views, which = views_of_rounds(self.human, candidates, row, rounds)
         # The policies that distinguish moments suffice to distinguish rounds.
@@ -193,7 +188,9 @@ class ViewTableBuilder:
         if self._proposal is not None:
             attended, seed = self._attended_in(rounds, self._proposal)
             each = len(attended)
-            candidates = {name: value.repeat_interleave(each) for name, value in candidates.items()}
+            candidates = {
+                name: value.repeat_interleave(each, 0) for name, value in candidates.items()
+            }
             values = attended.values.items()
             candidates |= {name: value.repeat(len(alive)) for name, value in values}
             if alive.device.type == "cpu":
@@ -204,7 +201,7 @@ class ViewTableBuilder:
                 )
         number = len(alive) * each
         row = torch.arange(len(rounds), device=alive.device).repeat_interleave(number)
-        candidates = {name: value.repeat(len(rounds)) for name, value in candidates.items()}
+        candidates = {name: repeated(own, len(rounds)) for name, own in candidates.items()}
         views, which = views_of_rounds(self.human, candidates, row, rounds)
         if self.screening is not None and self.screening.resolution > 0:
             views, place = self._merged(views, self.screening)
@@ -312,7 +309,7 @@ class ViewTableBuilder:
         steps = max(len(real) for _, real in self._recorded)
         for part, (combination, view) in zip(self._rounds, self._seen, strict=True):
             # Keep only views of combinations that were never dropped.
-            row = torch.full((prod(self.sizes),), NO_VIEW, device=self.alive.device)
+            row = torch.full((self.grid.number,), NO_VIEW, device=self.alive.device)
             row[combination] = view
             needed, place = torch.unique(row[self.alive], return_inverse=True)
             row = torch.full_like(row, NO_VIEW)
@@ -334,8 +331,7 @@ class ViewTableBuilder:
         elif attended:
             attention = Attention.of_rounds(self._attended, attended)
         return ViewTable(
-            sites=tuple(self.grid),
-            sizes=self.sizes,
+            grid=self.grid,
             index=torch.stack(index)[None],
             moments=torch.cat(shifted)[None],
             belief=torch.cat([part.belief for part in rounds])[None],
@@ -374,6 +370,11 @@ class ViewTableBuilder:
         """Log prior probability of each combination under each policy, ``[policies, M]``."""
         others = {name: policy for name, policy in self.policies.items() if name not in self.grid}
         return log_priors(self.human, self.grid, others, 1)[:, 0]
+
+
+def repeated(values: Tensor, number: int) -> Tensor:
+    """Repeat values ``[M, ...]`` one after the other, ``[number M, ...]``."""
+    return values.repeat(number, *[1] * (values.dim() - 1))
 
 
 def _bytes_of_a_view(human: HumanModel) -> int:

@@ -41,10 +41,10 @@ def discrete_names(trace: Trace) -> set[str]:
 
 
 class Readable(Mapping[str, Tensor]):
-    """Implants for ``perceive``: records which are read and refuses those that are not discrete.
+    """Implants for ``perceive``: records which are read and refuses those that are not sampled.
 
     Args:
-        known: values of discrete sites by name.
+        known: values of sites by name.
         others: names of all other values that ``prior`` returned.
     """
 
@@ -56,8 +56,8 @@ class Readable(Mapping[str, Tensor]):
     def __getitem__(self, name: str) -> Tensor:
         if name not in self.known:
             raise HumanModelError(
-                f'perceive() reads "{name}", which is not a discrete site of prior() or '
-                f"round_latents(); it can read: {', '.join(self.known) or 'none'}"
+                f'perceive() reads "{name}", which is no site of prior() or round_latents(); it '
+                f"can read: {', '.join(self.known) or 'none'}"
             )
         self.read.add(name)
         return self.known[name]

@@ -15,7 +15,6 @@ from mirror_ppl.inference.results.fitting import fit_people
 from mirror_ppl.inference.svi import SVIOptions, _prune, continuous_guide, fit_implants
 from mirror_ppl.likelihood.combinations import log_priors
 from mirror_ppl.likelihood.compiled import ViewTables
-from mirror_ppl.likelihood.enumeration import combination_values
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, combination_scores
 from mirror_ppl.likelihood.view_table import NO_VIEW
@@ -124,7 +123,7 @@ def test_pruning_gives_up_whoever_is_hopeless(few, table):
     policy = some_policy(few, 3)
     one = {name: value[None] for name, value in policy.items()}
     score = combination_scores(table, log_likelihoods(few, policy, table))
-    score = score + log_priors(few, combination_values(few, table), one, 3)[0]
+    score = score + log_priors(few, table.grid, one, 3)[0]
     behind = score.amax(-1, keepdim=True) - score
     margin = behind[behind > 0].median().item() + 1e-3
     compiled = ViewTables(few, table)

@@ -15,7 +15,8 @@ from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.engines import InferenceOptions, infer, run_identity
 from mirror_ppl.inference.sampler import Sampler
 from mirror_ppl.likelihood.combination_sets import fixed_prior
-from mirror_ppl.likelihood.combinations import grid_of, perceived_sites
+from mirror_ppl.likelihood.combinations import perceived_sites
+from mirror_ppl.likelihood.grid import grid_of
 from mirror_ppl.likelihood.compiled import compile
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.screening import Screening

@@ -11,8 +11,9 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.sampler import Sampler
 from mirror_ppl.likelihood.combination_sets import EquivalentCombinations, fixed_prior
-from mirror_ppl.likelihood.combinations import grid_of, perceived_sites
-from mirror_ppl.likelihood.enumeration import combination_values, log_joints
+from mirror_ppl.likelihood.combinations import perceived_sites
+from mirror_ppl.likelihood.grid import grid_of
+from mirror_ppl.likelihood.enumeration import log_joints
 from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -119,7 +120,7 @@ def test_weights_of_sets_are_those_of_all_combinations(self_model, one):
     found = sampler.weighted()
     every = log_joints(human, table, found.policy)[:, 0]
     torch.testing.assert_close(found.log_joint.logsumexp(-1), every.logsumexp(-1))
-    drawn = found.sample(4000, combination_values(human, table))
+    drawn = found.sample(4000, table.grid)
     probabilities = (found.log_weights.exp()[:, None] * every.double().softmax(-1)).sum(0)
     number = drawn["sight_front_own"] * 2 + drawn["assumes_clear"]
     share = torch.bincount(number.flatten(), minlength=14) / 4000

@@ -21,7 +21,7 @@ from mirror_ppl.domains import get_domain
 from mirror_ppl.likelihood import combinations, compiled, densities
 from mirror_ppl.likelihood.compiled import ViewTables
 from mirror_ppl.likelihood.densities import log_correction
-from mirror_ppl.likelihood.enumeration import combination_values, log_joints
+from mirror_ppl.likelihood.enumeration import log_joints
 from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.loading import load_human_model
@@ -91,7 +91,7 @@ def assert_compiled(human, rounds, log_density):
     table = build_view_table(human, rounds, values=100_000)
     draws = draw_prior(human, 1, DRAWS, 0)
     policy = {name: value for name, value in draws.items() if name not in table.sites}
-    grid = combination_values(human, table)
+    grid = table.grid
     given = log_prior(human, policy) + log_correction(human, grid, policy, 1)[:, 0]
     joint = log_joints(human, table, policy)[:, 0] + given[:, None]  # [S, M]
     own = joint[torch.arange(DRAWS), table.combination(draws).flatten()]

@@ -12,7 +12,7 @@ from mirror_ppl.likelihood.combinations import discrete_sites
 from mirror_ppl.likelihood.compiled import compile
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.densities import log_correction
-from mirror_ppl.likelihood.enumeration import combination_values, log_joints
+from mirror_ppl.likelihood.enumeration import log_joints
 from mirror_ppl.models.prior import draw_prior, sample_sites
 from mirror_ppl.models.toy import ToyHuman
 from mirror_ppl.models.variants import VARIANTS
@@ -112,7 +112,7 @@ def test_parts_add_up_to_the_program(say, self_model):
     drawn = sum(nodes[name]["fn"].log_prob(policy[name])[:, 0, 0] for name in policy)
     parts = drawn + log_correction(human, perceived, policy, 1)[:, 0]
     joint = log_joints(human, compiled.table, policy)[:, 0]  # [S, M]
-    values = combination_values(human, compiled.table)["reach"]
+    values = compiled.table.grid["reach"]
     for place, value in enumerate(values):
         every = policy | {"reach": torch.full_like(draws["reach"], int(value))}
         expected = compiled.log_joint(every)[:, 0]

@@ -18,7 +18,6 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.sampler import Sampler
 from mirror_ppl.likelihood import likely_policies
 from mirror_ppl.likelihood.combinations import log_priors
-from mirror_ppl.likelihood.enumeration import combination_values
 from mirror_ppl.likelihood.likely_policies import LikelyPolicies
 from mirror_ppl.likelihood.policies import draw_policies
 from mirror_ppl.likelihood.screening import Screening
@@ -66,7 +65,7 @@ def test_screening_drops_whoever_falls_behind_and_never_the_best(
         torch.manual_seed(screening.seed)
         ways = human.prior()
     likelihood = log_likelihoods(human, ways, whole)
-    grid = combination_values(human, whole)
+    grid = whole.grid
     others = {name: value for name, value in ways.items() if name not in grid}
     prior = log_priors(human, grid, others, 1)
     expected = torch.ones(rounds.num_people, 14, dtype=torch.bool)
@@ -111,7 +110,7 @@ def test_policies_near_the_person_are_the_most_probable_ones(self_model, recordi
     rounds add up, and twice as many rounds choose anew."""
     human, own = Few(self_model), recordings.select_people([1])
     table = build_view_table(human, own.select_rounds(range(4)))
-    grid = combination_values(human, table)
+    grid = table.grid
     # Views are numbered from round to round.
     rounds = [
         (views_of(table, 0).kept(views.unique()), (torch.arange(14), views - views.min()))

@@ -17,11 +17,8 @@ from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.hierarchical_proposal import dependent_sites
 from mirror_ppl.inference.population.pooling import Pooling
 from mirror_ppl.likelihood.combination_sets import fixed_prior
-from mirror_ppl.likelihood.combinations import (
-    grid_of,
-    perceived_sites,
-    require_own_attention,
-)
+from mirror_ppl.likelihood.combinations import perceived_sites, require_own_attention
+from mirror_ppl.likelihood.grid import grid_of
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.family import Preferring

@@ -30,7 +30,6 @@ from mirror_ppl.inference.results.left_out import LeftOut, left_out
 from mirror_ppl.inference.results.perception_checks import perception_p_values
 from mirror_ppl.inference.results.posterior_predictive import chosen_log_probability, predict_rounds
 from mirror_ppl.inference.results.summary import predictive
-from mirror_ppl.likelihood.combinations import grid_of, perceived_sites
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.family import KIND, OneOfKinds
@@ -190,7 +189,7 @@ def no_implants(
             views = ViewTableBuilder(human, None)
             views.add(rounds_of(train, 0))
             weighted = sample_importance(human, views.table(), QUICK)
-            drawn = weighted.sample(DRAWS, grid_of(perceived_sites(human)))
+            drawn = weighted.sample(DRAWS, views.grid)
     else:
         drawn = draw_prior(human, 1, DRAWS, seed % 2**32)
     found = predict_rounds(human, test, drawn).cpu()

@@ -27,10 +27,9 @@ from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.population.pooling import Pooling, Population
-from mirror_ppl.likelihood.combinations import perceived_sites
+from mirror_ppl.likelihood.combinations import needs_points, perceived_sites
 from mirror_ppl.likelihood.enumeration import (
     acts_on_beliefs,
-    combination_values,
     conditioned,
     log_joints,
 )
@@ -38,7 +37,7 @@ from mirror_ppl.likelihood.round_views import Rounds
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, rounds_of
-from mirror_ppl.likelihood.view_table import combination_number
+from mirror_ppl.likelihood.grid import combination_number
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel, has_own_program
 from mirror_ppl.models.simulation import play_rounds
@@ -140,10 +139,13 @@ def identify(
         rounds: simulated rounds in each scenario; 0 for none.
 
     Returns:
-        The identifiability; ``None`` for models without discrete perceptual implants, in which
-        percepts affect actions other than through beliefs, or with a program of their own.
+        The identifiability; ``None`` for models in which perception reads no site, a continuous
+        one or more than 100,000 combinations of values, or in which percepts affect actions other
+        than through beliefs, or with a program of their own.
     """
     if has_own_program(human):
+        return None
+    if needs_points(human):
         return None
     sizes = {site: len(support) for site, support in perceived_sites(human).items()}
     if not sizes:
@@ -167,7 +169,7 @@ def identify(
             return None
         policy = {name: value[chosen] for name, value in own.items() if name not in sizes}
         joint = log_joints(human, table, policy, candidates)[:, 0]
-        grid = {site: value[candidates] for site, value in combination_values(human, table).items()}
+        grid = table.grid.chosen(candidates)
         if population is not None and pooling is not None:
             # The mean over the population, which is independent of this person's policy draws.
             probabilities = {

@@ -32,7 +32,7 @@ from torch import Tensor
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.inference.results.checks import REPLICATES, more_often
-from mirror_ppl.likelihood.combinations import perceived_sites
+from mirror_ppl.likelihood.combinations import perceived_names
 from mirror_ppl.likelihood.enumeration import acts_on_beliefs, conditioned
 from mirror_ppl.likelihood.round_views import Rounds
 from mirror_ppl.likelihood.tables import rounds_of
@@ -79,7 +79,7 @@ def perception_p_values(
     # With a power below 1, errors of the robot's values count more than what perception changes.
     if human.likelihood_power != 1 or not bool(rounds.mask.any()):
         return {}
-    sites = perceived_sites(human)
+    sites = perceived_names(human)
     if not acts_on_beliefs(human, sites):
         return {}
     draws = checked_draws(human, draws, 1)

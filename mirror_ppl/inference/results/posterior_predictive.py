@@ -9,11 +9,11 @@ from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.likelihood.combinations import perceived_sites
+from mirror_ppl.likelihood.combinations import needs_points, perceived_names, perceived_sites
 from mirror_ppl.likelihood.compiled import Sequential
 from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.tables import build_view_table
-from mirror_ppl.likelihood.view_table import combination_number
+from mirror_ppl.likelihood.grid import Grid, combination_number
 from mirror_ppl.models.human import HumanModel, has_own_program
 from mirror_ppl.models.prior import checked_draws
 from mirror_ppl.models.recorded import check_rounds
@@ -43,15 +43,23 @@ def predict_rounds(
     draws = checked_draws(human, draws, rounds.num_people)
     if has_own_program(human):
         return Sequential(human, rounds).predict(draws)
+    points = needs_points(human)
     sizes = {site: len(support) for site, support in perceived_sites(human).items()}
+    read = perceived_names(human)
     parts = []
     for person in range(rounds.num_people):
         own = {name: value[:, [person]] for name, value in draws.items()}
         recorded = rounds.part(range(person, person + 1))
         # Only combinations among the draws: exact views, without screening or merging.
-        drawn = combination_number({site: own[site][:, 0, 0] for site in sizes}, sizes).unique()
-        some = [drawn.to(rounds.actions.device)]  # also where there are no sites
-        table = build_view_table(human, recorded, some, likely=own, values=PREDICTED_VALUES)
+        grid, some = None, None
+        if points:
+            grid = Grid({site: own[site][:, 0, 0] for site in read}, read=read)
+        else:
+            drawn = combination_number({site: own[site][:, 0, 0] for site in sizes}, sizes).unique()
+            some = [drawn.to(rounds.actions.device)]  # also where there are no sites
+        table = build_view_table(
+            human, recorded, some, likely=own, values=PREDICTED_VALUES, grid=grid
+        )
         parts.append(predict_actions(human, table, own))
         if bool(parts[-1].isnan().any()):
             raise HumanModelError(f"{type(human).__name__}.act returns nan")

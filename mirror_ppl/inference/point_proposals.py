@@ -1,0 +1,300 @@
+"""Points near a person's posterior, for models whose perception cannot be summed out exactly.
+
+The first points are drawn from the prior (:mod:`mirror_ppl.likelihood.points`), and few of them may
+explain the rounds. Stage by stage, others are drawn around those that do, and views are compiled
+anew for all that are left (Cornuet, Marin, Mira and Robert, *Adaptive multiple importance sampling*,
+2012). Each point counts by the ratio of its prior density and the mixture of all proposals so far,
+so that sums over points are consistent estimates, whatever was proposed. A proposal is densest at
+the points around which it was fitted, which would count too little; its density there leaves their
+own kernel out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import biject_to
+
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
+from mirror_ppl.inference.pareto import pareto_smoothed
+from mirror_ppl.inference.weighted import Weighted
+from mirror_ppl.likelihood.grid import Grid
+from mirror_ppl.likelihood.points import PriorPoints
+from mirror_ppl.likelihood.round_views import Rounds
+from mirror_ppl.likelihood.screening import Screening
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import sample_sites
+from mirror_ppl.randomness import forked
+
+ENOUGH = 200.0
+"""Effective number of points at which no stage is added."""
+STAGES = 6
+"""Largest number of stages after the first."""
+NEW_POINTS = 4096
+"""Points of a stage."""
+FROM_PRIOR = 0.2
+"""Share of these that are drawn from the prior, so that weights are bounded."""
+LEARNED_FROM = 64.0
+"""Least effective number of points around which others are drawn; probabilities are tempered until
+it is reached."""
+NOISE = 0.02
+"""Share of the prior's variance, over all directions, that is not looked at: it has hardly any effect
+on what is seen."""
+INFORMED = 0.5
+"""Variance, relative to the prior's, below which rounds inform about a direction."""
+ANYHOW = 0.1
+"""Probability that a discrete site of a new point is drawn uniformly, in place of its centre's."""
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """The space in which points are proposed: unconstrained for continuous sites.
+
+    Attributes:
+        transforms: from unconstrained space, of the continuous sites.
+        shapes: shape of a value of each of these there.
+        supports: of the discrete sites, ``[n]``.
+    """
+
+    transforms: dict[str, Any]
+    shapes: dict[str, torch.Size]
+    supports: dict[str, Tensor]
+
+    @classmethod
+    def of(cls, human: HumanModel, grid: Grid) -> Coordinates:
+        """Find the coordinates of a grid's sites."""
+        with forked():
+            kinds = {name: node["fn"] for name, node in sample_sites(human, 1).items()}
+        supports = {
+            site: kinds[site].enumerate_support(expand=False).flatten()
+            for site in grid
+            if kinds[site].has_enumerate_support
+        }
+        transforms = {
+            site: biject_to(kinds[site].support) for site in grid if site not in supports
+        }
+        shapes = {site: own.inv(grid[site][:1]).shape[1:] for site, own in transforms.items()}
+        return cls(transforms, shapes, supports)
+
+    def places(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Return the continuous sites of values ``[M, ...]`` in unconstrained space, ``[M, D]``."""
+        number = len(next(iter(values.values())))
+        parts = [own.inv(values[site]).reshape(number, -1) for site, own in self.transforms.items()]
+        return torch.cat(parts, -1).double() if parts else torch.zeros(number, 0).double()
+
+    def at(self, places: Tensor, like: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return continuous sites ``[M, ...]`` at places ``[M, D]``, with others' dtypes."""
+        parts = places.split([shape.numel() for shape in self.shapes.values()], -1)
+        return {
+            site: own(part.to(like[site]).view(len(part), *self.shapes[site]))
+            for (site, own), part in zip(self.transforms.items(), parts, strict=False)
+        }
+
+    def log_abs_det(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Log absolute determinant ``[M]`` of the map from unconstrained space, at these values."""
+        total = torch.zeros(len(next(iter(values.values()))), dtype=torch.double)
+        for site, own in self.transforms.items():
+            found = own.log_abs_det_jacobian(own.inv(values[site]), values[site])
+            total = total.to(found.device) + found.reshape(len(total), -1).sum(-1)
+        return total
+
+
+@dataclass(frozen=True)
+class Whitening:
+    """Whitens points from the prior: coordinates with mean 0, variance 1 and no correlation.
+
+    Attributes:
+        coordinates: unconstrained space.
+        mean: of points from the prior there ``[D]``.
+        factor: matrix ``[D, D]`` by which centred places are multiplied.
+        leading: number of the first whitened coordinates, which have all but `NOISE` of the variance.
+    """
+
+    coordinates: Coordinates
+    mean: Tensor
+    factor: Tensor
+    leading: int
+
+    @classmethod
+    def of(cls, coordinates: Coordinates, points: Grid) -> Whitening:
+        """Fit the transformation to points from the prior."""
+        places = coordinates.places(points)
+        scale = places.std(0) + 1e-9
+        dims = len(scale)
+        correlation = torch.cov((places / scale).T).reshape(dims, dims)
+        variances, vectors = torch.linalg.eigh(correlation)
+        variances, vectors = variances.flip(0).clamp(min=1e-9), vectors.flip(1)
+        explained = variances.cumsum(0) - variances < (1 - NOISE) * variances.sum()
+        factor = vectors / scale[:, None] / variances.sqrt()
+        return cls(coordinates, places.mean(0), factor, int(explained.sum()))
+
+    def whiten(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Return whitened coordinates ``[M, D]`` of values ``[M, ...]``."""
+        return (self.coordinates.places(values) - self.mean) @ self.factor
+
+    def values(self, white: Tensor, like: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the continuous sites at whitened coordinates."""
+        places = torch.linalg.solve(self.factor.T, white.T).T + self.mean
+        return self.coordinates.at(places, like)
+
+    def log_abs_det(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Log absolute determinant ``[M]`` of the map to whitened coordinates, at these values."""
+        return torch.linalg.slogdet(self.factor).logabsdet - self.coordinates.log_abs_det(values)
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """A mixture of densities around n weighted points.
+
+    Rounds inform about few directions of the whitened space. In these, the density is a mixture of
+    Gaussians around the points, with centres drawn together so that it has the points' covariance
+    (West, *Mixture models, Monte Carlo, Bayesian updating and dynamic models*, 1993); in all others
+    it is a standard Gaussian, like the prior. Discrete sites are those of the centre or, at times,
+    any.
+
+    Attributes:
+        whitening: the space.
+        points: the weighted points, values ``[n, ...]``.
+        names: their numbers among all points that were ever drawn ``[n]``.
+        log_weights: normalized ``[n]``.
+        directions: orthonormal, in whitened space ``[D, K]``.
+        centres: ``[n, K]``.
+        spread: standard deviations of the Gaussians ``[K]``.
+    """
+
+    whitening: Whitening
+    points: Grid
+    names: Tensor
+    log_weights: Tensor
+    directions: Tensor
+    centres: Tensor
+    spread: Tensor
+
+    @classmethod
+    def around(
+        cls, whitening: Whitening, points: Grid, names: Tensor, probability: Tensor
+    ) -> Kernels:
+        """Fit kernels to points ``[n]`` with these numbers and probabilities."""
+        log_weights = tempered(probability.log(), LEARNED_FROM)
+        white = whitening.whiten(points)
+        weights, leading = log_weights.exp()[:, None], whitening.leading
+        mean = (weights * white).sum(0)
+        centred = (white - mean)[:, :leading]
+        variances, vectors = torch.linalg.eigh((weights * centred).T @ centred)
+        informed = (variances < INFORMED) | (mean[:leading] @ vectors).square().gt(1 - INFORMED)
+        vectors = vectors[:, informed]
+        directions = white.new_zeros(white.shape[-1], vectors.shape[-1])
+        directions[:leading] = vectors
+        effective, dims = float(1 / weights.square().sum()), vectors.shape[-1]
+        # Silverman's rule.
+        width = min(1.0, (4 / (effective * (dims + 2))) ** (1 / (dims + 4)))
+        return cls(
+            whitening,
+            points,
+            names,
+            log_weights,
+            directions,
+            mean @ directions + math.sqrt(1 - width**2) * (centred @ vectors),
+            width * variances[informed].clamp(min=1e-9).sqrt(),
+        )
+
+    def draw(self, number: int) -> dict[str, Tensor]:
+        """Draw values ``[number, ...]``, with the global random state."""
+        centre = torch.multinomial(self.log_weights.exp(), number, replacement=True)
+        white, noise = (
+            torch.randn(number, size).to(self.centres) for size in self.directions.shape
+        )
+        near = self.centres[centre] + noise * self.spread
+        white = white + (near - white @ self.directions) @ self.directions.T
+        values = self.whitening.values(white, self.points)
+        for site, support in self.whitening.coordinates.supports.items():
+            anyhow = torch.rand(number, device=support.device) < ANYHOW
+            other = support[torch.randint(len(support), (number,), device=support.device)]
+            values[site] = torch.where(anyhow, other, self.points[site][centre])
+        return values
+
+    def log_density(self, values: Mapping[str, Tensor], names: Tensor) -> Tensor:
+        """Log density ``[M]`` of values ``[M, ...]`` with these numbers, without their own kernels."""
+        white = self.whitening.whiten(values)
+        own = white @ self.directions
+        found = -torch.cdist(own / self.spread, self.centres / self.spread).square() / 2  # [M, n]
+        for site, support in self.whitening.coordinates.supports.items():
+            same = values[site][:, None] == self.points[site]
+            found = found + (ANYHOW / len(support) + (1 - ANYHOW) * same.double()).log()
+        own_kernel = names[:, None] == self.names
+        weights = self.log_weights.expand(own_kernel.shape).masked_fill(own_kernel, -torch.inf)
+        near = (found + weights.log_softmax(-1)).logsumexp(-1) - self.spread.log().sum()
+        others = (own.square().sum(-1) - white.square().sum(-1)) / 2
+        constant = white.shape[-1] * math.log(2 * math.pi) / 2
+        return near + others - constant + self.whitening.log_abs_det(values)
+
+
+def tempered(log_weights: Tensor, effective: float) -> Tensor:
+    """Temper log weights ``[n]`` until this many, at most half of them, are effective."""
+    effective = min(effective, len(log_weights) / 2)
+    low, high = 0.0, 1.0
+    if float(1 / torch.softmax(log_weights, 0).square().sum()) < effective:
+        for _ in range(30):
+            power = (low + high) / 2
+            weights = torch.softmax(power * log_weights, 0)
+            enough = float(1 / weights.square().sum()) >= effective
+            low, high = (power, high) if enough else (low, power)
+        high = low
+    return torch.log_softmax(high * log_weights, 0)
+
+
+@torch.no_grad()
+def with_points_near(
+    builder: ViewTableBuilder,
+    found: Weighted,
+    rounds: Rounds,
+    screening: Screening | None,
+    options: ImportanceOptions,
+) -> tuple[ViewTableBuilder, Weighted]:
+    """Add points near the posterior until enough are effective (global random state).
+
+    Args:
+        builder: views of one person's rounds under points from the prior.
+        found: weighted draws given these.
+        rounds: all rounds of the person.
+        screening: when to drop points.
+        options: settings of importance sampling.
+
+    Returns:
+        Views and weighted draws of the last stage. Their Pareto k is the larger one of those of
+        draws and of points.
+    """
+    human = builder.human
+    prior = PriorPoints.of(human)
+    whitening = Whitening.of(Coordinates.of(human, builder.grid), builder.grid)
+    names, drawn = torch.arange(builder.grid.number), builder.grid.number
+    from_prior, others = builder.grid.number, []
+    for _ in range(STAGES):
+        points, probability = found.combination_probabilities()
+        if 1 / float(probability.square().sum()) >= ENOUGH:
+            break
+        kept, names = builder.grid.chosen(points), names[points]
+        others.append(Kernels.around(whitening, kept, names, probability))
+        anybody = round(FROM_PRIOR * NEW_POINTS)
+        new = prior.values(anybody, int(torch.randint(2**31, ())))
+        near = others[-1].draw(NEW_POINTS - anybody)
+        values = {site: torch.cat([kept[site], new[site], near[site]]) for site in kept}
+        names = torch.cat([names, drawn + torch.arange(NEW_POINTS)])
+        drawn, from_prior = drawn + NEW_POINTS, from_prior + anybody
+        each = [math.log(from_prior) + prior.log_density(values).double()]
+        each += [math.log(NEW_POINTS - anybody) + one.log_density(values, names) for one in others]
+        density = torch.stack(each).logsumexp(0).to(prior.like)
+        grid = Grid(values, log_proposal=density, read=kept.read)
+        builder = ViewTableBuilder(human, screening, grid=grid)
+        builder.add(rounds)
+        found = sample_importance(human, builder.table(), options, found)
+    points, probability = found.combination_probabilities()
+    _, pareto_k = pareto_smoothed(probability.log())
+    effective = 1 / float(probability.square().sum())
+    return builder, replace(found, pareto_k=max(found.pareto_k, pareto_k), points=effective)
