@@ -19,8 +19,8 @@ from torch.distributions import biject_to
 from mirror_ppl.inference.marginal_elbo import MarginalELBO
 from mirror_ppl.inference.svi import continuous_guide
 from mirror_ppl.likelihood.combinations import log_priors, perceived_sites
-from mirror_ppl.likelihood.grid import grid_of
 from mirror_ppl.likelihood.compiled import ViewTables
+from mirror_ppl.likelihood.grid import grid_of
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.likelihood.view_table import ViewTable

@@ -62,7 +62,7 @@ class Record:
             with many values to sum over at each step, and SQIL with long rounds.
         people: the simulated people, a :class:`~mirror_ppl.people.base.DomainPeople`; those of
             :mod:`mirror_ppl.people.robot_like` unless given.
-        human_models: classes that replace the human models of these names.
+        human_models: classes of human models by name, which replace the package's or add others.
         pictures: of what people see, :class:`~mirror_ppl.plots.picture.SightPicture` by file name.
         rounds: pictures of rounds, by method of :class:`mirror_ppl.plots.fit.FitPlots`.
     """

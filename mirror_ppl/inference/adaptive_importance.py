@@ -7,7 +7,7 @@ is consistent for every proposal, given enough draws (:mod:`mirror_ppl.inference
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from pyro.distributions import MultivariateStudentT
@@ -33,6 +33,8 @@ FEW = 16.0
 TAILS = 8.0
 """Degrees of freedom of the proposal. In unconstrained space priors of probabilities have
 exponential tails, which are heavier than Gaussian ones."""
+COARSE_DRAWS, COARSE_ENOUGH = 256, 64.0
+"""Proposals of a stage, and effective draws that are enough, if another pass follows."""
 PRUNING_DRAWS = 64
 """Draws from the prior after which combinations of discrete sites are dropped."""
 
@@ -67,6 +69,15 @@ class ImportanceOptions:
             object.__setattr__(self, name, whole_number(getattr(self, name), name, least))
         for name in ("enough", "wider", "prune_margin", "resolution"):
             object.__setattr__(self, name, real_number(getattr(self, name), name, 0))
+
+
+def coarse(options: ImportanceOptions) -> ImportanceOptions:
+    """Reduced settings for passes over a person's rounds before the last."""
+    return replace(
+        options,
+        proposals=min(COARSE_DRAWS, options.proposals),
+        enough=min(COARSE_ENOUGH, options.enough),
+    )
 
 
 @torch.no_grad()

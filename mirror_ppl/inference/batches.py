@@ -9,10 +9,10 @@ import torch
 
 from mirror_ppl.checkpoints import read_checkpoint
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.inference.adaptive_importance import ImportanceOptions
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions, coarse
 from mirror_ppl.inference.engine import Inferred, Job
 from mirror_ppl.inference.importance import infer_by_importance
-from mirror_ppl.inference.second_look import LIKELY_DRAWS, coarse, looks_twice
+from mirror_ppl.inference.second_look import LIKELY_DRAWS, looks_twice
 from mirror_ppl.likelihood.compiled import Compiled, Sequential, compile
 from mirror_ppl.models.human import has_own_program
 from mirror_ppl.models.measured import alike_measured, measured_draws

@@ -8,11 +8,11 @@ from math import nan
 
 import torch
 
-from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions, coarse, sample_importance
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.kinds import infer_kinds, models_by_kind
 from mirror_ppl.inference.point_proposals import with_points_near
-from mirror_ppl.inference.second_look import coarse, looks_twice, second_look
+from mirror_ppl.inference.second_look import looks_twice, second_look
 from mirror_ppl.inference.weighted import Weighted
 from mirror_ppl.likelihood.combinations import needs_points
 from mirror_ppl.likelihood.densities import adds_to_prior
@@ -54,16 +54,16 @@ def infer_by_importance(
             human = builder.human
             # Independent of other people, and of how many draws they took.
             seed_everything(job.seed_of(person))
-            first = coarse(job.settings) if looks_twice(human) else job.settings
+            points = needs_points(human)
+            again = looks_twice(human) or points
+            first = coarse(job.settings) if again else job.settings
             engine, own = first_pass(builder, first)
             if looks_twice(human):
                 rounds = rounds_of(job.rounds, person)
                 builder, own = second_look(human, rounds, job.screening, job.settings, builder, own)
-            elif needs_points(human):
+            elif points:
                 rounds = rounds_of(job.rounds, person)
-                builder, own = with_points_near(
-                    builder, own, rounds, job.screening, job.settings
-                )
+                builder, own = with_points_near(builder, own, rounds, job.screening, job.settings)
             draws = own.sample(job.draws, builder.grid)
             if job.rounds.measurements:
                 draws |= measured_draws(job.rounds.select_people([person]), job.draws)

@@ -9,10 +9,11 @@ from mirror_ppl.checks import real_number, require_kind, seed_number, whole_numb
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.errors import InputError
-from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions, coarse, sample_importance
 from mirror_ppl.inference.amortized import AmortizedOptions, sample_amortized
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, guide_screening, require_network_of
-from mirror_ppl.inference.second_look import coarse, looks_twice, second_look
+from mirror_ppl.inference.point_proposals import with_points_near
+from mirror_ppl.inference.second_look import looks_twice, second_look
 from mirror_ppl.inference.weighted import Weighted
 from mirror_ppl.likelihood.round_views import Rounds
 from mirror_ppl.likelihood.screening import Screening
@@ -46,8 +47,8 @@ class OnlinePosterior:
 
     Raises:
         InputError: an argument is of another type.
-        HumanModelError: perceptual implants cannot be marginalized, or affect actions other than
-            through beliefs.
+        HumanModelError: perceptual implants affect actions other than through beliefs, or a
+            continuous one cannot be inferred.
 
     Attributes:
         person: id of the person; ``None`` before the first round.
@@ -131,23 +132,26 @@ class OnlinePosterior:
         began = monotonic()
         with forked():
             seed_everything(self.seed * 1_000_003 + self.rounds)
-            found = self._last = self._weighted()
-            drawn = found.sample(number, self._builder.grid)
+            builder, found = self._weighted()
+            drawn = found.sample(number, builder.grid)
+        self._last = found
         self.pareto_k = found.pareto_k
         self.seconds = self.seconds[0], monotonic() - began
         return {name: drawn[name] for name in self._order}
 
-    def _weighted(self) -> Weighted:
-        human, options = self.human, ImportanceOptions()
+    def _weighted(self) -> tuple[ViewTableBuilder, Weighted]:
+        human, builder, options = self.human, self._builder, ImportanceOptions()
+        points = builder.grid.sizes is None
         if self.network is None:
-            first = coarse(options) if looks_twice(human) else options
-            found = sample_importance(human, self._builder.table(), first, self._near)
+            first = coarse(options) if points or looks_twice(human) else options
+            found = sample_importance(human, builder.table(), first, self._near)
         else:
             # Sites are checked at the first call only.
             sites = None if math.isnan(self.pareto_k) else self._sites
-            found = sample_amortized(human, self.network, self._builder, AT_ONCE, sites, self._near)
+            found = sample_amortized(human, self.network, builder, AT_ONCE, sites, self._near)
+        rounds = Rounds.joined(self._rounds)
         if looks_twice(human):
-            _, found = second_look(
-                human, Rounds.joined(self._rounds), self._screening, options, self._builder, found
-            )
-        return found
+            return second_look(human, rounds, self._screening, options, builder, found)
+        if points:
+            return with_points_near(builder, found, rounds, self._screening, options)
+        return builder, found

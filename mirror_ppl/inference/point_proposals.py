@@ -2,7 +2,7 @@
 
 The first points are drawn from the prior (:mod:`mirror_ppl.likelihood.points`), and few of them may
 explain the rounds. Stage by stage, others are drawn around those that do, and views are compiled
-anew for all that are left (Cornuet, Marin, Mira and Robert, *Adaptive multiple importance sampling*,
+anew for all that are left (adaptive multiple importance sampling; Cornuet, Marin, Mira and Robert,
 2012). Each point counts by the ratio of its prior density and the mixture of all proposals so far,
 so that sums over points are consistent estimates, whatever was proposed. A proposal is densest at
 the points around which it was fitted, which would count too little; its density there leaves their
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.distributions import biject_to
 
-from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions, coarse, sample_importance
 from mirror_ppl.inference.pareto import pareto_smoothed
 from mirror_ppl.inference.weighted import Weighted
 from mirror_ppl.likelihood.grid import Grid
@@ -44,10 +44,11 @@ LEARNED_FROM = 64.0
 """Least effective number of points around which others are drawn; probabilities are tempered until
 it is reached."""
 NOISE = 0.02
-"""Share of the prior's variance, over all directions, that is not looked at: it has hardly any effect
-on what is seen."""
+"""Share of the prior's variance that is not looked at: it hardly changes what is seen."""
 INFORMED = 0.5
 """Variance, relative to the prior's, below which rounds inform about a direction."""
+NEGLIGIBLE = 1e-3
+"""Posterior probability of the points that are dropped between stages."""
 ANYHOW = 0.1
 """Probability that a discrete site of a new point is drawn uniformly, in place of its centre's."""
 
@@ -76,9 +77,7 @@ class Coordinates:
             for site in grid
             if kinds[site].has_enumerate_support
         }
-        transforms = {
-            site: biject_to(kinds[site].support) for site in grid if site not in supports
-        }
+        transforms = {site: biject_to(kinds[site].support) for site in grid if site not in supports}
         shapes = {site: own.inv(grid[site][:1]).shape[1:] for site, own in transforms.items()}
         return cls(transforms, shapes, supports)
 
@@ -113,7 +112,7 @@ class Whitening:
         coordinates: unconstrained space.
         mean: of points from the prior there ``[D]``.
         factor: matrix ``[D, D]`` by which centred places are multiplied.
-        leading: number of the first whitened coordinates, which have all but `NOISE` of the variance.
+        leading: number of the first whitened coordinates that have all but `NOISE` of the variance.
     """
 
     coordinates: Coordinates
@@ -220,7 +219,12 @@ class Kernels:
         return values
 
     def log_density(self, values: Mapping[str, Tensor], names: Tensor) -> Tensor:
-        """Log density ``[M]`` of values ``[M, ...]`` with these numbers, without their own kernels."""
+        """Log density ``[M]`` of values ``[M, ...]`` without their own kernels.
+
+        Args:
+            values: of points.
+            names: their numbers ``[M]``.
+        """
         white = self.whitening.whiten(values)
         own = white @ self.directions
         found = -torch.cdist(own / self.spread, self.centres / self.spread).square() / 2  # [M, n]
@@ -261,7 +265,7 @@ def with_points_near(
 
     Args:
         builder: views of one person's rounds under points from the prior.
-        found: weighted draws given these.
+        found: weighted draws given these, few are enough.
         rounds: all rounds of the person.
         screening: when to drop points.
         options: settings of importance sampling.
@@ -279,8 +283,11 @@ def with_points_near(
         points, probability = found.combination_probabilities()
         if 1 / float(probability.square().sum()) >= ENOUGH:
             break
-        kept, names = builder.grid.chosen(points), names[points]
-        others.append(Kernels.around(whitening, kept, names, probability))
+        some = builder.grid.chosen(points)
+        others.append(Kernels.around(whitening, some, names[points], probability))
+        order = probability.argsort(descending=True)
+        most = points[order[probability[order].cumsum(0) - probability[order] < 1 - NEGLIGIBLE]]
+        kept, names = builder.grid.chosen(most), names[most]
         anybody = round(FROM_PRIOR * NEW_POINTS)
         new = prior.values(anybody, int(torch.randint(2**31, ())))
         near = others[-1].draw(NEW_POINTS - anybody)
@@ -293,7 +300,8 @@ def with_points_near(
         grid = Grid(values, log_proposal=density, read=kept.read)
         builder = ViewTableBuilder(human, screening, grid=grid)
         builder.add(rounds)
-        found = sample_importance(human, builder.table(), options, found)
+        found = sample_importance(human, builder.table(), coarse(options), found)
+    found = sample_importance(human, builder.table(), options, found)
     points, probability = found.combination_probabilities()
     _, pareto_k = pareto_smoothed(probability.log())
     effective = 1 / float(probability.square().sum())

@@ -7,8 +7,6 @@ coarse posterior; the second proposes attention from it.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.weighted import Weighted
 from mirror_ppl.likelihood.round_views import Rounds
@@ -16,22 +14,13 @@ from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
 
-LIKELY_DRAWS, COARSE_DRAWS = 64, 256
-"""Posterior draws that propose attention, and proposals of a stage of the first pass."""
+LIKELY_DRAWS = 64
+"""Posterior draws that propose attention."""
 
 
 def looks_twice(human: HumanModel) -> bool:
     """True if attention is sampled, so that a second pass improves its proposal."""
     return human.has_round_latents and not human.chained
-
-
-def coarse(options: ImportanceOptions) -> ImportanceOptions:
-    """Reduced settings for the first pass."""
-    return replace(
-        options,
-        proposals=min(COARSE_DRAWS, options.proposals),
-        enough=min(LIKELY_DRAWS, options.enough),
-    )
 
 
 def second_look(

@@ -155,6 +155,4 @@ def draw_combinations(
 ) -> dict[str, Tensor]:
     """Draw ``[S, P, 1]`` values of the table's sites by log weights ``[P, M]``."""
     chosen = torch.multinomial(torch.softmax(log_weights, -1), number, replacement=True).T
-    return {
-        site: value[chosen[..., None]] for site, value in table.grid.items()
-    }
+    return {site: value[chosen[..., None]] for site, value in table.grid.items()}

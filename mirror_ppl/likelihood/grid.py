@@ -52,7 +52,9 @@ class Grid(Mapping[str, Tensor]):
     @property
     def number(self) -> int:
         """The number of joint values M."""
-        return prod(self.sizes) if self.sizes is not None else len(next(iter(self.by_site.values())))
+        return (
+            prod(self.sizes) if self.sizes is not None else len(next(iter(self.by_site.values())))
+        )
 
     def chosen(self, some: Tensor) -> Grid:
         """Select joint values by number ``[n]``, as points."""

@@ -1,10 +1,11 @@
 """Builder of the table of views of one person's rounds.
 
-Every combination of what perception reads (:mod:`mirror_ppl.likelihood.grid`) is a candidate. After some rounds, candidates are dropped
-whose likelihood is far below the best one's under every policy. Later rounds need no views of them,
-and exact marginalization stays cheap. A candidate is kept if recorded actions are impossible under
-it and some policy: with other policies it may be the most probable one. It is also kept if it is
-not far below under :mod:`mirror_ppl.likelihood.likely_policies`.
+Every joint value of what perception reads (:mod:`mirror_ppl.likelihood.grid`), a *combination*, is
+a candidate. After some rounds, candidates are dropped whose likelihood is far below the best one's
+under every policy. Later rounds need no views of them, and sums stay cheap. A candidate is kept if
+recorded actions are impossible under it and some policy: with other policies it may be the most
+probable one. It is also kept if it is not far below under
+:mod:`mirror_ppl.likelihood.likely_policies`.
 """
 
 from __future__ import annotations

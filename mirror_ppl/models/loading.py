@@ -30,8 +30,14 @@ def model_name(class_name: str) -> str:
     return class_name
 
 
+def model_names() -> tuple[str, ...]:
+    """Names of the package's human models, of which some are of one domain only."""
+    own = (human_models_of(domain) for domain in known_domains())
+    return tuple(dict.fromkeys(name for names in (VARIANTS, *own) for name in names))
+
+
 def human_models_of(domain: Domain) -> Mapping[str, type[HumanModel]]:
-    """Return the package's human models by name, some replaced by those of the domain."""
+    """Return the package's human models by name, with those of the domain."""
     return {**VARIANTS, **domain.record.part("human_models")}
 
 
@@ -50,7 +56,7 @@ def checked_base(human: HumanModel) -> HumanModel:
             stacklevel=3,
         )
     own = human.self_model.domain.record.part("human_models")
-    if own and not isinstance(human, tuple(own.values())):
+    if MIRROR in own and not isinstance(human, tuple(own.values())):
         needed = own[MIRROR]
         warnings.warn(
             f"{type(human).__name__} lacks the sites in which people of "
@@ -64,7 +70,7 @@ def checked_base(human: HumanModel) -> HumanModel:
 
 def file_of(specification: str | None) -> Path | None:
     """Return the file in ``path/to/file.py:Class``; None for the package's own models."""
-    if specification is None or specification in VARIANTS:
+    if specification is None or specification in model_names():
         return None
     return Path(specification.rpartition(":")[0])
 
@@ -75,27 +81,33 @@ def load_human_model(
     """Make a human model.
 
     Args:
-        specification: a name in ``VARIANTS``, or ``path/to/file.py:Class``, a class derived from
-            :class:`HumanModel`; the package's own model unless given.
+        specification: a name of :func:`model_names`, or ``path/to/file.py:Class``, a class derived
+            from :class:`HumanModel`; the package's own model unless given.
         self_model: the robot's networks.
 
     Raises:
-        HumanModelError: the file or class is missing, does not import, or is not a human model.
+        HumanModelError: the file or class is missing, does not import, or is not a human model; or
+            the domain has no model of that name.
     """
     if isinstance(specification, os.PathLike):
         specification = os.fspath(specification)
     if specification is not None:
         require_kind(specification, str, "specification")
-    if specification is None or specification in VARIANTS:
+    names = model_names()
+    if specification is None or specification in names:
         require_kind(self_model, SelfModel, "self_model")
-        name = specification or MIRROR
-        return human_models_of(self_model.domain)[name](self_model)
+        name, domain = specification or MIRROR, self_model.domain
+        offered = human_models_of(domain)
+        if name not in offered:
+            others = ", ".join(one.name for one in known_domains() if name in human_models_of(one))
+            raise HumanModelError(f"{name}: {domain.name} has no such human model, only {others}")
+        return offered[name](self_model)
     path_text, colon, name = specification.rpartition(":")
     if not colon or not name.isidentifier():
-        close = get_close_matches(specification.lower(), VARIANTS, n=1)
+        close = get_close_matches(specification.lower(), names, n=1)
         raise HumanModelError(
             f'"{specification}" is not of the form path/to/file.py:Class, and none of '
-            f"{', '.join(VARIANTS)}" + "".join(f'; perhaps you meant "{name}"' for name in close)
+            f"{', '.join(names)}" + "".join(f'; perhaps you meant "{name}"' for name in close)
         )
     path = Path(path_text)
     chosen = class_in_file(path, name, HumanModel, HumanModelError)

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.errors import InputError
+from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.inference.amortized import log_evidence
 from mirror_ppl.inference.amortized_guide import (
     DROPOUT,

@@ -10,8 +10,8 @@ from mirror_ppl.inference import importance
 from mirror_ppl.inference.engine import Inferred, Job
 from mirror_ppl.inference.kinds import _combinations, models_by_kind
 from mirror_ppl.likelihood.combinations import perceived_sites
-from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.grid import combination_number
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.family import KIND, LATE, AnyKind, Late
 from mirror_ppl.models.loading import load_human_model

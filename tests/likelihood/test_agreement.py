@@ -16,9 +16,9 @@ from mirror_ppl.inference.engines import InferenceOptions, infer, run_identity
 from mirror_ppl.inference.sampler import Sampler
 from mirror_ppl.likelihood.combination_sets import fixed_prior
 from mirror_ppl.likelihood.combinations import perceived_sites
-from mirror_ppl.likelihood.grid import grid_of
 from mirror_ppl.likelihood.compiled import compile
 from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.likelihood.grid import grid_of
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import build_view_table, rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder

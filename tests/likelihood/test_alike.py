@@ -12,8 +12,8 @@ from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.sampler import Sampler
 from mirror_ppl.likelihood.combination_sets import EquivalentCombinations, fixed_prior
 from mirror_ppl.likelihood.combinations import perceived_sites
-from mirror_ppl.likelihood.grid import grid_of
 from mirror_ppl.likelihood.enumeration import log_joints
+from mirror_ppl.likelihood.grid import grid_of
 from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights

@@ -20,9 +20,9 @@ from mirror_ppl.communication import (
 from mirror_ppl.data import asset_path, concatenate, load_demonstrations
 from mirror_ppl.domains.bomb_defusal.human_variants import BombDefusalAnyKind
 from mirror_ppl.errors import HumanModelError, InputError
+from mirror_ppl.likelihood.grid import combination_number
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of
-from mirror_ppl.likelihood.grid import combination_number
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.family import (

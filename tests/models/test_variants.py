@@ -11,9 +11,9 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.combinations import perceived_sites
 from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.likelihood.grid import combination_number
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, combination_scores
-from mirror_ppl.likelihood.grid import combination_number
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.implants import NOTICES, assumption_sites, sight_sites
 from mirror_ppl.models.loading import load_human_model

@@ -10,12 +10,10 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, Visibility, by_eye
-from mirror_ppl.domains.highway.lidar import RANGE, SECTORS
-from mirror_ppl.domains.highway.world import Highway
-from mirror_ppl.errors import HumanModelError
+from mirror_ppl.domains.highway.lidar import SECTORS
+from mirror_ppl.domains.highway.world import KNOTS
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.human import HumanModel, Implants
-from mirror_ppl.models.self_model import SelfModel
 
 LOG_REACH = "log_reach"
 """Site of the logarithm of the reach of sight in metres in each of the 36 sectors."""
@@ -32,18 +30,14 @@ JITTER = 1e-4
 class ByAngle(HumanModel):
     """Sees differently far in each of the 36 sectors, equally far in similar directions.
 
-    A Gaussian process on the circle (periodic kernel; MacKay, *Introduction to Gaussian processes*,
-    1998) is the prior of the logarithm of the reach::
+    The prior of the logarithm of the reach is a Gaussian process on the circle, with a periodic
+    kernel (MacKay, *Introduction to Gaussian processes*, 1998)::
 
         log_reach   ~ Normal(log 20, K)           metres, in the 36 sectors
         K(a, b)     = 0.7² + 0.9² exp(-2 sin²((a - b) / 2) / w²)         w = 45 degrees
-        n_t,k       = distance_t,k <= exp(log_reach_k)
+        reach_k     = exp(log_reach_k), rounded down to 0, 5, 10, 15, 20, 30, 45 or 60 metres
+        n_t,k       = distance_t,k <= reach_k
     """
-
-    def __init__(self, self_model: SelfModel) -> None:
-        super().__init__(self_model)
-        if not isinstance(self.domain, Highway):
-            raise HumanModelError(f"by-angle: {self.domain.name} has no lidar")
 
     def prior(self) -> dict[str, Tensor]:
         """Sample the reach, the assumption and the policy implants."""
@@ -60,8 +54,13 @@ class ByAngle(HumanModel):
         """Return what is within the reach of its sector; a reach of 60 m is everything."""
         del step
         _, distance = self.domain.distance(observation)
-        reach = implants[LOG_REACH].exp()
-        return by_eye(self.domain, (distance <= reach) | (reach >= RANGE))
+        return by_eye(self.domain, distance <= reach_in_bins(implants[LOG_REACH]))
+
+
+def reach_in_bins(log_reach: Tensor) -> Tensor:
+    """Reach of sight in metres, rounded down to the world's ``reach_bins``."""
+    bins = torch.tensor(KNOTS, dtype=log_reach.dtype, device=log_reach.device)
+    return bins[torch.bucketize(log_reach.exp(), bins, right=True) - 1]
 
 
 def _factor() -> Tensor:

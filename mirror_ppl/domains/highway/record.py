@@ -42,6 +42,7 @@ RECORD = Record(
     sight_scale=1.0,
     measured=100,
     people="mirror_ppl.domains.highway.participants:DRIVERS",
+    human_models="mirror_ppl.domains.highway.human_variants:HUMAN_MODELS",
     pictures="mirror_ppl.domains.highway.sight:PICTURES",
     planning={"predict_with": "values", "items": 2},
     baselines={

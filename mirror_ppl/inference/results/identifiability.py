@@ -33,11 +33,11 @@ from mirror_ppl.likelihood.enumeration import (
     conditioned,
     log_joints,
 )
+from mirror_ppl.likelihood.grid import combination_number
 from mirror_ppl.likelihood.round_views import Rounds
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, rounds_of
-from mirror_ppl.likelihood.grid import combination_number
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel, has_own_program
 from mirror_ppl.models.simulation import play_rounds

@@ -11,9 +11,9 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.combinations import needs_points, perceived_names, perceived_sites
 from mirror_ppl.likelihood.compiled import Sequential
+from mirror_ppl.likelihood.grid import Grid, combination_number
 from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.tables import build_view_table
-from mirror_ppl.likelihood.grid import Grid, combination_number
 from mirror_ppl.models.human import HumanModel, has_own_program
 from mirror_ppl.models.prior import checked_draws
 from mirror_ppl.models.recorded import check_rounds
