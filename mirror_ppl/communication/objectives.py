@@ -22,6 +22,7 @@ from mirror_ppl.communication.rollouts import World, robot_belief
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.likelihood.attention import attention_sites
+from mirror_ppl.likelihood.combinations import perceived_names
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.prior import draw_prior
@@ -270,7 +271,8 @@ def beliefs_have_density(human: HumanModel) -> bool:
         m.name: torch.zeros(1, len(m.items), dtype=torch.bool, device=device)
         for m in domain.modalities
     }
-    implants = {name: value[0, 0] for name, value in draw_prior(human, 1, 1, 0).items()}
+    drawn = draw_prior(human, 1, 1, 0)
+    implants = {name: drawn[name][0, 0] for name in perceived_names(human)}
     implants |= {name: support[:1] for name, support in attention_sites(human).items()}
     known = human.nothing_known(1, device=device)
     view, _ = human.perceive(implants, known, observation, nothing, 0)

@@ -62,7 +62,7 @@ def infer_by_importance(
                 rounds = rounds_of(job.rounds, person)
                 builder, own = second_look(human, rounds, job.screening, job.settings, builder, own)
             elif points:
-                rounds = rounds_of(job.rounds, person)
+                rounds = [rounds_of(job.rounds, person)]
                 builder, own = with_points_near(builder, own, rounds, job.screening, job.settings)
             draws = own.sample(job.draws, builder.grid)
             if job.rounds.measurements:

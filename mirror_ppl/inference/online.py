@@ -149,9 +149,9 @@ class OnlinePosterior:
             # Sites are checked at the first call only.
             sites = None if math.isnan(self.pareto_k) else self._sites
             found = sample_amortized(human, self.network, builder, AT_ONCE, sites, self._near)
-        rounds = Rounds.joined(self._rounds)
         if looks_twice(human):
+            rounds = Rounds.joined(self._rounds)
             return second_look(human, rounds, self._screening, options, builder, found)
         if points:
-            return with_points_near(builder, found, rounds, self._screening, options)
+            return with_points_near(builder, found, self._rounds, self._screening, options)
         return builder, found

@@ -12,7 +12,7 @@ own kernel out.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -40,6 +40,8 @@ NEW_POINTS = 4096
 """Points of a stage."""
 FROM_PRIOR = 0.2
 """Share of these that are drawn from the prior, so that weights are bounded."""
+CENTRES = 512
+"""Largest number of points around which others are drawn, chosen by their probabilities."""
 LEARNED_FROM = 64.0
 """Least effective number of points around which others are drawn; probabilities are tempered until
 it is reached."""
@@ -193,13 +195,19 @@ class Kernels:
         effective, dims = float(1 / weights.square().sum()), vectors.shape[-1]
         # Silverman's rule.
         width = min(1.0, (4 / (effective * (dims + 2))) ** (1 / (dims + 4)))
+        centres = mean @ directions + math.sqrt(1 - width**2) * (centred @ vectors)
+        some = torch.arange(len(names), device=names.device)
+        if len(some) > CENTRES:
+            drawn = torch.multinomial(log_weights.exp(), CENTRES, replacement=True)
+            some, often = drawn.unique(return_counts=True)
+            log_weights = (often.to(log_weights) / CENTRES).log()
         return cls(
             whitening,
-            points,
-            names,
+            points.chosen(some),
+            names[some],
             log_weights,
             directions,
-            mean @ directions + math.sqrt(1 - width**2) * (centred @ vectors),
+            centres[some],
             width * variances[informed].clamp(min=1e-9).sqrt(),
         )
 
@@ -257,7 +265,7 @@ def tempered(log_weights: Tensor, effective: float) -> Tensor:
 def with_points_near(
     builder: ViewTableBuilder,
     found: Weighted,
-    rounds: Rounds,
+    rounds: Sequence[Rounds],
     screening: Screening | None,
     options: ImportanceOptions,
 ) -> tuple[ViewTableBuilder, Weighted]:
@@ -283,8 +291,8 @@ def with_points_near(
         points, probability = found.combination_probabilities()
         if 1 / float(probability.square().sum()) >= ENOUGH:
             break
-        some = builder.grid.chosen(points)
-        others.append(Kernels.around(whitening, some, names[points], probability))
+        near = builder.grid.chosen(points)
+        others.append(Kernels.around(whitening, near, names[points], probability))
         order = probability.argsort(descending=True)
         most = points[order[probability[order].cumsum(0) - probability[order] < 1 - NEGLIGIBLE]]
         kept, names = builder.grid.chosen(most), names[most]
@@ -299,7 +307,8 @@ def with_points_near(
         density = torch.stack(each).logsumexp(0).to(prior.like)
         grid = Grid(values, log_proposal=density, read=kept.read)
         builder = ViewTableBuilder(human, screening, grid=grid)
-        builder.add(rounds)
+        for some in rounds:
+            builder.add(some)
         found = sample_importance(human, builder.table(), coarse(options), found)
     found = sample_importance(human, builder.table(), options, found)
     points, probability = found.combination_probabilities()

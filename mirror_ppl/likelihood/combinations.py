@@ -114,6 +114,19 @@ def unread_sites(human: HumanModel) -> Sites:
     return _trial(human)[1] if known is None else known[1]
 
 
+def copied_sites(human: HumanModel) -> list[str]:
+    """Sites that ``perceive`` reads if it goes through all implants, as to copy them.
+
+    The discrete sites, and continuous ones on which nothing else depends: others can be read by
+    name, but who copies implants hardly means them.
+    """
+    found = dependencies(human)
+    used = found.actions.union(*found.prior.values(), *found.round_latents.values())
+    discrete = discrete_sites(human)
+    names = draw_prior(human, 1, 1, 0)
+    return [name for name in names if name in discrete or name not in used]
+
+
 def _trial(human: HumanModel) -> tuple[tuple[str, ...], Sites]:
     """Sites that perception reads, and others; found once for each set of sites."""
     values = {name: value[0, 0] for name, value in draw_prior(human, 1, 1, 0).items()}
@@ -134,7 +147,7 @@ def _read(human: HumanModel, values: Mapping[str, Tensor]) -> set[str]:
     """
     domain, device = human.domain, next(human.parameters()).device
     attention = {name: support[:1] for name, support in attention_sites(human).items()}
-    implants = Readable({**values, **attention})
+    implants = Readable({**values, **attention}, copied=(*copied_sites(human), *attention))
     enumerated = {*discrete_sites(human), *attention}
     state = domain.initial(1, torch.Generator(device).manual_seed(0))
     without: Any = human.nothing_known(1, device=device)

@@ -87,7 +87,8 @@ class PriorPoints:
             names = ", ".join(sorted(both))
             raise HumanModelError(
                 f"act() reads a continuous site that perceive() reads, too ({names}), which no "
-                "engine can infer; sample two sites, and let one depend on the other"
+                "engine can infer; sample two sites, and let the one that perceive() reads depend "
+                "on the other"
             )
         sites = set(read)
         outside = False

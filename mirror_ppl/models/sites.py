@@ -46,11 +46,19 @@ class Readable(Mapping[str, Tensor]):
     Args:
         known: values of sites by name.
         others: names of all other values that ``prior`` returned.
+        copied: names of the sites that are read by who goes through all implants, as to copy them;
+            all that are known unless given.
     """
 
-    def __init__(self, known: Mapping[str, Tensor], others: Collection[str] = ()) -> None:
+    def __init__(
+        self,
+        known: Mapping[str, Tensor],
+        others: Collection[str] = (),
+        copied: Collection[str] | None = None,
+    ) -> None:
         self.known = known
         self.others = others
+        self.copied = known if copied is None else copied
         self.read: set[str] = set()
 
     def __getitem__(self, name: str) -> Tensor:
@@ -68,10 +76,10 @@ class Readable(Mapping[str, Tensor]):
         return False
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.known)
+        return iter(self.copied)
 
     def __len__(self) -> int:
-        return len(self.known)
+        return len(self.copied)
 
 
 class OnlyRead(dict[str, Tensor]):

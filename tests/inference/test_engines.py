@@ -119,7 +119,7 @@ def test_a_prior_that_depends_on_what_is_seen_is_refused(toy, recordings):
 
     human = Hierarchical(toy.self_model)
     for guide in ("importance", "svi"):
-        with pytest.raises(HumanModelError, match='"depends" depends on a discrete site'):
+        with pytest.raises(HumanModelError, match='"depends" depends on a site'):
             infer(human, recordings, InferenceOptions(guide, 5), 0)
 
 

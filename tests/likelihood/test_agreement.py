@@ -193,7 +193,7 @@ class Within(ToyHuman):
         (SomebodySeesAll, "SomebodySeesAll says something that engines do not see"),
         (Clamped, 'prior returns other values of "reach" than those that it sampled'),
         (NoticesAtOnce, 'round_latents returns other values of "noticed_'),
-        (Assuming, 'perceive.. reads "assumes_clear", which is not a discrete site'),
+        (Assuming, 'perceive.. reads "assumes_clear", which is no site'),
         (PlateInAct, '"gaze" is in the plate "items" at dimension -3'),
         (PlateInRounds, '"said" is in the plate "questions" at dimension -3'),
         (Within, 'what "inner" can be depends on another site'),

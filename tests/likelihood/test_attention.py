@@ -301,6 +301,6 @@ class ReadsSight(OneRadius):
 def test_attention_that_depends_on_what_is_seen_is_refused(self_model, recordings):
     """On a value in the middle, too."""
     one = recordings.select_people([0]).select_rounds([0])
-    message = '"away" of round_latents depends on a discrete site that perceive'
+    message = '"away" of round_latents depends on a site that perceive'
     with pytest.raises(HumanModelError, match=message):
         build_view_table(ReadsSight(self_model), one)

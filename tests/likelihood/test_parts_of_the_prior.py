@@ -152,7 +152,7 @@ class LosesProvenance(VARIANTS["per-item"]):
 
 def test_attention_that_depends_on_perception_is_refused_where_provenance_is_lost(self_model):
     rounds = simulate("driving", "fog", "paper", people=1, rounds=1, seed=100)
-    with pytest.raises(HumanModelError, match="depends on a discrete site that perceive"):
+    with pytest.raises(HumanModelError, match="depends on a site that perceive"):
         compile(LosesProvenance(self_model), rounds)
 
 

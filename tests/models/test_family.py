@@ -20,7 +20,6 @@ from mirror_ppl.communication import (
 from mirror_ppl.data import asset_path, concatenate, load_demonstrations
 from mirror_ppl.domains.bomb_defusal.human_variants import BombDefusalAnyKind
 from mirror_ppl.errors import HumanModelError, InputError
-from mirror_ppl.likelihood.grid import combination_number
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
@@ -321,8 +320,7 @@ def test_what_few_kinds_of_people_could_have_seen_is_not_given_up(few_reaches, k
     rounds = play_rounds(human, implants, 12, "fog", torch.Generator().manual_seed(100))
     builder = ViewTableBuilder(everybody, Screening())
     builder.add(rounds_of(rounds, 0))
-    own = {site: implants[site][0, 0] for site in builder.grid}
-    true = combination_number(own, dict(zip(builder.grid, builder.sizes, strict=True)))
+    true = builder.grid.place_of({site: implants[site][0, 0] for site in builder.grid})
     assert (builder.alive == true).any()
     kinds = builder.policies[KIND].flatten().tolist()
     assert kinds == [*range(len(KINDS))] * Screening().policies
