@@ -25,6 +25,7 @@ from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
+from mirror_ppl.models.handlers import WithoutSites
 from mirror_ppl.models.human import ACTION, HumanModel
 from mirror_ppl.models.sites import latent_sites, latent_values, sample_nodes
 from mirror_ppl.randomness import forked, seed_everything
@@ -86,7 +87,9 @@ def forget(human: HumanModel) -> None:
 def _run(human: HumanModel) -> Dependencies:
     like = next(human.parameters())
     belief = like.new_zeros(1, 1, human.belief_size)
-    values, action = human.action_values(belief), torch.zeros(1, 1, dtype=torch.long)
+    with WithoutSites("action_values"):
+        values = human.action_values(belief)
+    action = torch.zeros(1, 1, dtype=torch.long)
     with (
         forked(),
         pyro.validation_enabled(False),
@@ -168,7 +171,9 @@ def _hidden_causes(
     with forked():
         seed_everything(0)
         belief = torch.randn(1, 1, human.belief_size).to(like)
-    values, action = human.action_values(belief), torch.zeros(1, 1, dtype=torch.long)
+    with WithoutSites("action_values"):
+        values = human.action_values(belief)
+    action = torch.zeros(1, 1, dtype=torch.long)
     same = {name: detach_provenance(value) for name, value in latents.items()}
 
     def said(given: Mapping[str, Tensor]) -> tuple[list[Tensor], list[Tensor]]:

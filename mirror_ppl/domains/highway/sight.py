@@ -6,8 +6,10 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from matplotlib.projections.polar import PolarAxes
 
+from mirror_ppl.domains.highway.human_variants import LOG_REACH, reach_in_bins
 from mirror_ppl.domains.highway.lidar import RANGE, SECTORS
 from mirror_ppl.domains.highway.world import DIRECTION_OF, KNOTS, Highway
 from mirror_ppl.models.implants import SIGHT
@@ -34,15 +36,16 @@ COLUMNS = 4
 
 
 def has_sight(data: az.InferenceData) -> bool:
-    """True if the posterior has thresholds of sight."""
-    return all(site in data["posterior"] for site in SITES)
+    """True if the posterior has thresholds of sight, or a reach by angle."""
+    posterior = data["posterior"]
+    return LOG_REACH in posterior or all(site in posterior for site in SITES)
 
 
 def sight_probability(data: az.InferenceData, person: str) -> np.ndarray:
     """Return the probability ``[36, 7]`` that a driver sees a car in each sector and distance.
 
     Args:
-        data: with the sites ``sight_...``, in metres.
+        data: with the sites ``sight_...`` in metres, or ``log_reach``.
         person: id of the person.
 
     Returns:
@@ -53,9 +56,11 @@ def sight_probability(data: az.InferenceData, person: str) -> np.ndarray:
         UnknownNameError: no person has that id.
     """
     own = of_person(data, "posterior", person)
-    reach = np.stack([draws(own[site]) for site in SITES], -1)  # [S, 4]
-    seen = (np.array(KNOTS[1:]) <= reach[..., None] + 1e-3).mean(0)
-    return seen[list(DIRECTION_OF)]
+    if LOG_REACH in own:
+        reach = reach_in_bins(torch.from_numpy(draws(own[LOG_REACH]))).numpy()  # [S, 36]
+    else:
+        reach = np.stack([draws(own[site]) for site in SITES], -1)[:, list(DIRECTION_OF)]
+    return (np.array(KNOTS[1:]) <= reach[..., None] + 1e-3).mean(0)
 
 
 def sight_picture(data: az.InferenceData) -> Picture:
