@@ -1,4 +1,14 @@
-"""A person who sees up to a distance of their own: continuous sites that perception reads."""
+"""A person who sees up to a distance of their own: continuous sites that perception reads.
+
+    python -m mirror_ppl.fit --human-model docs/examples/sight_in_cells.py:SightInCells
+
+Cars are seen within two distances, in cells of the road::
+
+    ahead_p  ~ LogNormal(1, .7)
+    behind_p ~ LogNormal(0, .7)
+
+``docs/extending.md`` explains how to write such a class.
+"""
 
 import pyro
 import pyro.distributions as dist

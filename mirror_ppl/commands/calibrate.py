@@ -62,9 +62,9 @@ class Options:
     """Folder for the results; made if it is not there."""
     human_model: str | None = None
     """Another human model: all (averages over several models for each person), late, noticing,
-    forgetting, preferring, hard-of-hearing, one-radius, per-item, perceptual-only, policy-only or
-    no-implants, or one of your own, path/to/file.py:Class, whose code is run (see
-    docs/extending.md)."""
+    forgetting, preferring, hard-of-hearing, one-radius, per-item, perceptual-only, policy-only,
+    no-implants or (highway) by-angle, or one of your own, path/to/file.py:Class, whose code is run
+    (see docs/extending.md)."""
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
     jobs: int = -1

@@ -64,9 +64,9 @@ class Options:
     recordings with 36 rounds or more (rounds 31 to 36 are held out), else three quarters."""
     human_model: str | None = None
     """Another human model: all (averages over several models for each person), late, noticing,
-    forgetting, preferring, hard-of-hearing, one-radius, per-item, perceptual-only, policy-only or
-    no-implants, or one of your own, path/to/file.py:Class, whose code is run (see
-    docs/extending.md)."""
+    forgetting, preferring, hard-of-hearing, one-radius, per-item, perceptual-only, policy-only,
+    no-implants or (highway) by-angle, or one of your own, path/to/file.py:Class, whose code is run
+    (see docs/extending.md)."""
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
     guide: str = "auto"

@@ -56,7 +56,8 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
     if doubtful:
         print(
             f"Importance weights are not to be relied on for {', '.join(doubtful)} (Pareto k above "
-            f"{HIGH_PARETO_K}): --guide svi or nuts may do better, or another --human-model"
+            f"{HIGH_PARETO_K}): another --human-model may do better, or --guide svi or nuts, if "
+            "perception reads no continuous site"
         )
     few = [
         person["id"]

@@ -20,7 +20,8 @@ def pareto_smoothed(log_weights: Tensor) -> tuple[Tensor, float]:
 
     The largest weights are replaced by the expected order statistics of the generalized Pareto
     distribution that fits them; none exceeds the largest one. They are unreliable for k > 0.7. k is
-    infinite if the tail is too short, and minus infinity if all weights are equal.
+    infinite if the tail is too short, and minus infinity if all weights, or the largest ones, are
+    equal.
 
     Args:
         log_weights: in double precision, not normalized; not all minus infinity.
@@ -31,11 +32,15 @@ def pareto_smoothed(log_weights: Tensor) -> tuple[Tensor, float]:
     number = len(weights)
     ordered, order = weights.sort()
     most = math.ceil(min(number / 5, 3 * math.sqrt(number)))
+    if most > FEWEST and float(ordered[-most]) > -1e-9:  # bounded, and no tail to fit
+        return torch.log_softmax(weights, 0), -math.inf
     least = max(float(ordered[max(-most - 1, -number)]), math.log(torch.finfo(weights.dtype).tiny))
     tail = order[ordered > least]
     if len(tail) <= FEWEST:
         return torch.log_softmax(weights, 0), math.inf
     above = weights[tail].exp() - math.exp(least)
+    if float(above.min()) > (1 - 1e-9) * float(above.max()):  # bounded, and no distribution to fit
+        return torch.log_softmax(weights, 0), -math.inf
     k, scale = fit_generalized_pareto(above.cpu())
     if math.isfinite(k):
         share = (torch.arange(len(tail)).to(weights) + 0.5) / len(tail)

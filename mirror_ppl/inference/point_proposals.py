@@ -312,6 +312,10 @@ def with_points_near(
         found = sample_importance(human, builder.table(), coarse(options), found)
     found = sample_importance(human, builder.table(), options, found)
     points, probability = found.combination_probabilities()
-    _, pareto_k = pareto_smoothed(probability.log())
-    effective = 1 / float(probability.square().sum())
-    return builder, replace(found, pareto_k=max(found.pareto_k, pareto_k), points=effective)
+    # Weights of points from the prior alone are likelihoods, which are bounded.
+    _, of_points = pareto_smoothed(probability.log()) if others else (None, -math.inf)
+    return builder, replace(
+        found,
+        pareto_k=max(found.pareto_k, of_points),
+        points=1 / float(probability.square().sum()),
+    )

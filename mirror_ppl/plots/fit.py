@@ -63,8 +63,14 @@ class FitPlots:
         """Draw posterior entropy of the perceptual implants, and the most informative scenarios.
 
         Raises:
-            InputError: the data identify all perceptual implants, or none of them is discrete.
+            InputError: the data identify all perceptual implants, or none of them is discrete, or
+                perception reads a continuous one.
         """
+        if "identifiability" not in self.data.groups():
+            raise InputError(
+                "of what these people see, entropies are not computed: perception reads a "
+                "continuous site, or none"
+            )
         if not self._has_identifiability():
             raise InputError("nothing about what these people see is left to identify")
         return plot_identifiability(self.data)

@@ -34,3 +34,19 @@ def test_a_tail_too_short_has_no_finite_k():
     found, own = pareto_smoothed(torch.tensor([0.0, 1.0, 2.0]).double())
     assert own == math.inf
     torch.testing.assert_close(found.exp().sum(), torch.ones(()).double())
+
+
+@pytest.mark.parametrize("ties", [68, 200])
+def test_weights_that_are_bounded_by_many_equal_ones_are_reliable(ties):
+    """The tail of 500 weights is the largest 68, here equal; one fewer, and there is a tail."""
+    weights = torch.cat([torch.zeros(ties), -1 - torch.rand(500 - ties)]).double()
+    smoothed, k = pareto_smoothed(weights)
+    assert k == -math.inf
+    torch.testing.assert_close(smoothed, torch.log_softmax(weights, 0))
+
+
+def test_a_tail_of_equal_weights_above_others_is_not_fitted():
+    weights = torch.cat([torch.zeros(30), torch.full((470,), -2.0)]).double()
+    smoothed, k = pareto_smoothed(weights)
+    assert k == -math.inf
+    torch.testing.assert_close(smoothed, torch.log_softmax(weights, 0))

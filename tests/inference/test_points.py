@@ -11,10 +11,11 @@ from pyro import poutine
 from scipy import integrate, stats
 from torch.distributions import constraints
 
+import mirror_ppl
 from mirror_ppl.communication.objectives import predicted_choices
 from mirror_ppl.communication.person import Person, PlanningContext
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.errors import HumanModelError
+from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.inference import point_proposals
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.online import OnlinePosterior
@@ -393,3 +394,17 @@ def test_rates_of_the_toy_are_not_points(toy):
     assert set(whole_grid(Far(toy.self_model))) == {"far"}
     assert set(whole_grid(Scaled(toy.self_model))) == {"spread", "far"}
     assert set(PriorPoints.of(Able(toy.self_model)).given) == set(RATES)
+
+
+def test_a_fit_and_its_planner_work(recordings):
+    rounds = recordings.select_people(["person-02"]).select_rounds([0, 1])
+    human = f"{EXAMPLES}/sight_in_cells.py:SightInCells"
+    fit = mirror_ppl.infer(rounds, human=human, draws=32, train_rounds=1, explore=0)
+    assert {"ahead", "behind"} <= set(fit.person("person-02").implants.index)
+    for picture, message in (("sight", "no picture sight"), ("identifiability", "continuous")):
+        with pytest.raises(InputError, match=message):
+            getattr(fit.plot, picture)()
+    planner = mirror_ppl.Communicator(fit, "person-02", draws=16)
+    observed = {name: value[0, 0, 0] for name, value in rounds.observation().items()}
+    decision = planner.plan(RoundSoFar.begin(fit.human.domain, observed))
+    assert len(decision.flags) == sum(len(m.communicated) for m in fit.human.domain.modalities)

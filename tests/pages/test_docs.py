@@ -107,7 +107,7 @@ def test_python_of_the_communicator_runs(results, tmp_path, monkeypatch, capsys)
 def test_the_example_on_the_page_is_the_file():
     source = page("docs/examples/late_reactions.py")
     assert blocks(page("docs/extending.md"), "python")[0].strip() in source
-    for name in ("distracted", "looks_away"):
+    for name in ("distracted", "looks_away", "sight_in_cells"):
         source = page(f"docs/examples/{name}.py")
         assert any(block.strip() in source for block in blocks(page("docs/extending.md"), "python"))
 
@@ -313,13 +313,23 @@ class ReadsContinuous(HumanModel):
         return super().perceive(implants, knowledge, observation, told, step)
 
 
-class ManyValues(HumanModel):
+class ReadsWhatIsNotSampled(HumanModel):
     def prior(self):
-        uniform = dist.Categorical(torch.ones(100) / 100)
-        return super().prior() | {"a": pyro.sample("a", uniform)}
+        implants = super().prior()
+        return implants | {"twice": 2 * implants["sight_front_own"]}
 
     def perceive(self, implants, knowledge, observation, told, step):
-        assert (implants["a"] >= 0).all()
+        assert (implants["twice"] >= 0).all()
+        return super().perceive(implants, knowledge, observation, told, step)
+
+
+class DependsOnSight(HumanModel):
+    def prior(self):
+        far = pyro.sample("far", dist.Normal(0.0, 1.0))
+        return super().prior() | {"far": far, "mood": pyro.sample("mood", dist.Normal(far, 1.0))}
+
+    def perceive(self, implants, knowledge, observation, told, step):
+        assert implants["far"].isfinite().all()
         return super().perceive(implants, knowledge, observation, told, step)
 
 
@@ -352,7 +362,8 @@ MISTAKES = [
     UntoldMemory,
     Probabilities,
     ReadsContinuous,
-    ManyValues,
+    ReadsWhatIsNotSampled,
+    DependsOnSight,
     SampledTwice,
     NotAnEvent,
     Endless,
