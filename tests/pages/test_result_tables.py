@@ -18,6 +18,7 @@ from benchmarks import (
     planner_settings,
     pooling,
     sbc,
+    sight_by_angle,
     ties,
     value_errors,
 )
@@ -61,6 +62,12 @@ def test_the_choice_of_the_prior_over_directions_is_what_its_rows_say():
     assert f"the data are {-total['inf']:.1f} nats more probable under it" in words
     gained, lost = f"{total['0.5']:.1f}".lstrip("0"), f"{-total['2']:.1f}"
     assert f"another {gained}, one of two bins loses {lost}" in words
+
+
+def test_the_table_of_sight_by_angle_is_what_its_rows_say():
+    page = (DOCS / "highway.md").read_text()
+    found = page.partition("<!-- sight by angle -->\n")[2].partition("\n<!-- end -->")[0]
+    assert found == sight_by_angle.table(rows_in(sight_by_angle.ROWS))
 
 
 def test_the_table_of_planner_settings_is_what_its_rows_say():

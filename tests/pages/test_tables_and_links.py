@@ -20,7 +20,7 @@ from mirror_ppl.inference.sampler import MANY_MOMENTS, MERGING_DRAWS
 from mirror_ppl.inference.svi import SVIOptions
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.variants import VARIANTS
+from mirror_ppl.models.loading import model_names
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import populations_of
 from mirror_ppl.training import views as training_views
@@ -74,7 +74,7 @@ def test_every_command_is_real(where, line):
     assert options.get("population") in (*populations_of(domain.name), None)
     for option in ("card", "human_model"):
         path = str(options.get(option) or "").partition(":")[0]
-        assert not path or path in VARIANTS or (ROOT / path).is_file()
+        assert not path or path in model_names() or (ROOT / path).is_file()
 
 
 def test_commands_in_the_text_are_real():
