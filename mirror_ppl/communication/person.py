@@ -25,11 +25,12 @@ from mirror_ppl.communication.tracking import RunningSum, Tracks
 from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.attention import AttentionValues, Proposal
-from mirror_ppl.likelihood.combinations import perceived_names
+from mirror_ppl.likelihood.combinations import perceived_names, unread_sites
 from mirror_ppl.likelihood.densities import choices, log_weighted_latents
 from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import HumanModel, require_standard_program
 from mirror_ppl.models.prior import checked_draws
+from mirror_ppl.models.sites import OnlyRead
 from mirror_ppl.randomness import forked, seed_everything
 from mirror_ppl.row_hashing import distinct_rows, joint_rows
 
@@ -186,7 +187,8 @@ class Person:
         row: Tensor | None = None,
     ) -> Transition:
         """Return the transition of percepts ``[n]`` to their next step."""
-        implants = {name: value[percept] for name, value in self.percepts.items()}
+        known = {name: value[percept] for name, value in self.percepts.items()}
+        implants = OnlyRead(known, unread_sites(self.human))
         return Transition(implants, action, observation, told, row)
 
     def last_action(self, past: RoundSoFar, time: int) -> int:

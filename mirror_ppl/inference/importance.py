@@ -68,7 +68,7 @@ def infer_by_importance(
             if job.rounds.measurements:
                 draws |= measured_draws(job.rounds.select_people([person]), job.draws)
             evidence = (own.log_evidence, own.evidence_error) if estimated else (nan, nan)
-            probable = own.probable if builder.grid.sizes is not None else None
+            probable = None if points else own.probable
             found.append((own.pareto_k, *evidence, engine, probable))
             drawn.append(draws)
         order = sample_sites(job.human, 1)

@@ -141,7 +141,7 @@ class OnlinePosterior:
 
     def _weighted(self) -> tuple[ViewTableBuilder, Weighted]:
         human, builder, options = self.human, self._builder, ImportanceOptions()
-        points = builder.grid.sizes is None
+        points = builder.grid.is_points
         if self.network is None:
             first = coarse(options) if points or looks_twice(human) else options
             found = sample_importance(human, builder.table(), first, self._near)

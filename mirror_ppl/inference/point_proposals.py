@@ -3,10 +3,9 @@
 The first points are drawn from the prior (:mod:`mirror_ppl.likelihood.points`), and few of them may
 explain the rounds. Stage by stage, others are drawn around those that do, and views are compiled
 anew for all that are left (adaptive multiple importance sampling; Cornuet, Marin, Mira and Robert,
-2012). Each point counts by the ratio of its prior density and the mixture of all proposals so far,
-so that sums over points are consistent estimates, whatever was proposed. A proposal is densest at
-the points around which it was fitted, which would count too little; its density there leaves their
-own kernel out.
+2012). Each point counts by the ratio of its prior density and the mixture of all proposals so far.
+A proposal is densest at the points around which it was fitted, which would count too little; its
+density there leaves their own kernel out.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from torch.distributions import biject_to
 
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, coarse, sample_importance
 from mirror_ppl.inference.pareto import pareto_smoothed
-from mirror_ppl.inference.weighted import Weighted
+from mirror_ppl.inference.weighted import Weighted, tempered
 from mirror_ppl.likelihood.grid import Grid
 from mirror_ppl.likelihood.points import PriorPoints
 from mirror_ppl.likelihood.round_views import Rounds
@@ -32,8 +31,6 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.randomness import forked
 
-ENOUGH = 200.0
-"""Effective number of points at which no stage is added."""
 STAGES = 6
 """Largest number of stages after the first."""
 NEW_POINTS = 4096
@@ -51,7 +48,7 @@ INFORMED = 0.5
 """Variance, relative to the prior's, below which rounds inform about a direction."""
 NEGLIGIBLE = 1e-3
 """Posterior probability of the points that are dropped between stages."""
-ANYHOW = 0.1
+ANYHOW = 0.5
 """Probability that a discrete site of a new point is drawn uniformly, in place of its centre's."""
 
 
@@ -63,11 +60,13 @@ class Coordinates:
         transforms: from unconstrained space, of the continuous sites.
         shapes: shape of a value of each of these there.
         supports: of the discrete sites, ``[n]``.
+        like: an empty tensor on the device of points, in double precision.
     """
 
     transforms: dict[str, Any]
     shapes: dict[str, torch.Size]
     supports: dict[str, Tensor]
+    like: Tensor
 
     @classmethod
     def of(cls, human: HumanModel, grid: Grid) -> Coordinates:
@@ -81,28 +80,33 @@ class Coordinates:
         }
         transforms = {site: biject_to(kinds[site].support) for site in grid if site not in supports}
         shapes = {site: own.inv(grid[site][:1]).shape[1:] for site, own in transforms.items()}
-        return cls(transforms, shapes, supports)
+        like = next(human.parameters()).new_zeros(0, dtype=torch.double)
+        return cls(transforms, shapes, supports, like)
 
     def places(self, values: Mapping[str, Tensor]) -> Tensor:
         """Return the continuous sites of values ``[M, ...]`` in unconstrained space, ``[M, D]``."""
         number = len(next(iter(values.values())))
         parts = [own.inv(values[site]).reshape(number, -1) for site, own in self.transforms.items()]
-        return torch.cat(parts, -1).double() if parts else torch.zeros(number, 0).double()
+        return torch.cat(
+            [part.to(self.like) for part in (self.like.new_zeros(number, 0), *parts)], -1
+        )
 
     def at(self, places: Tensor, like: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return continuous sites ``[M, ...]`` at places ``[M, D]``, with others' dtypes."""
         parts = places.split([shape.numel() for shape in self.shapes.values()], -1)
         return {
-            site: own(part.to(like[site]).view(len(part), *self.shapes[site]))
+            site: own(part.to(like[site]).view(len(part), *self.shapes[site])).reshape(
+                len(part), *like[site].shape[1:]
+            )
             for (site, own), part in zip(self.transforms.items(), parts, strict=False)
         }
 
     def log_abs_det(self, values: Mapping[str, Tensor]) -> Tensor:
         """Log absolute determinant ``[M]`` of the map from unconstrained space, at these values."""
-        total = torch.zeros(len(next(iter(values.values()))), dtype=torch.double)
+        total = self.like.new_zeros(len(next(iter(values.values()))))
         for site, own in self.transforms.items():
             found = own.log_abs_det_jacobian(own.inv(values[site]), values[site])
-            total = total.to(found.device) + found.reshape(len(total), -1).sum(-1)
+            total = total + found.reshape(len(total), -1).sum(-1)
         return total
 
 
@@ -126,9 +130,9 @@ class Whitening:
     def of(cls, coordinates: Coordinates, points: Grid) -> Whitening:
         """Fit the transformation to points from the prior."""
         places = coordinates.places(points)
-        scale = places.std(0) + 1e-9
-        dims = len(scale)
-        correlation = torch.cov((places / scale).T).reshape(dims, dims)
+        centred = places - places.mean(0)
+        scale = centred.square().mean(0).sqrt() + 1e-9
+        correlation = (centred / scale).T @ (centred / scale) / len(places)
         variances, vectors = torch.linalg.eigh(correlation)
         variances, vectors = variances.flip(0).clamp(min=1e-9), vectors.flip(1)
         explained = variances.cumsum(0) - variances < (1 - NOISE) * variances.sum()
@@ -162,7 +166,7 @@ class Kernels:
     Attributes:
         whitening: the space.
         points: the weighted points, values ``[n, ...]``.
-        names: their numbers among all points that were ever drawn ``[n]``.
+        numbers: of these among all points that were ever drawn ``[n]``.
         log_weights: normalized ``[n]``.
         directions: orthonormal, in whitened space ``[D, K]``.
         centres: ``[n, K]``.
@@ -171,7 +175,7 @@ class Kernels:
 
     whitening: Whitening
     points: Grid
-    names: Tensor
+    numbers: Tensor
     log_weights: Tensor
     directions: Tensor
     centres: Tensor
@@ -179,24 +183,28 @@ class Kernels:
 
     @classmethod
     def around(
-        cls, whitening: Whitening, points: Grid, names: Tensor, probability: Tensor
+        cls, whitening: Whitening, points: Grid, numbers: Tensor, probability: Tensor
     ) -> Kernels:
         """Fit kernels to points ``[n]`` with these numbers and probabilities."""
-        log_weights = tempered(probability.log(), LEARNED_FROM)
+        log_weights = tempered(probability.log(), min(LEARNED_FROM, len(numbers) / 2))
         white = whitening.whiten(points)
         weights, leading = log_weights.exp()[:, None], whitening.leading
         mean = (weights * white).sum(0)
         centred = (white - mean)[:, :leading]
-        variances, vectors = torch.linalg.eigh((weights * centred).T @ centred)
+        effective = float(1 / weights.square().sum())
+        # Few points hardly vary in some directions by chance; the prior's covariance is added.
+        known = effective / (effective + leading + 1)
+        anyhow = torch.eye(leading, dtype=white.dtype, device=white.device)
+        covariance = known * (weights * centred).T @ centred + (1 - known) * anyhow
+        variances, vectors = torch.linalg.eigh(covariance)
         informed = (variances < INFORMED) | (mean[:leading] @ vectors).square().gt(1 - INFORMED)
         vectors = vectors[:, informed]
         directions = white.new_zeros(white.shape[-1], vectors.shape[-1])
         directions[:leading] = vectors
-        effective, dims = float(1 / weights.square().sum()), vectors.shape[-1]
-        # Silverman's rule.
+        dims = vectors.shape[-1]  # Silverman's rule
         width = min(1.0, (4 / (effective * (dims + 2))) ** (1 / (dims + 4)))
         centres = mean @ directions + math.sqrt(1 - width**2) * (centred @ vectors)
-        some = torch.arange(len(names), device=names.device)
+        some = torch.arange(len(numbers), device=numbers.device)
         if len(some) > CENTRES:
             drawn = torch.multinomial(log_weights.exp(), CENTRES, replacement=True)
             some, often = drawn.unique(return_counts=True)
@@ -204,11 +212,11 @@ class Kernels:
         return cls(
             whitening,
             points.chosen(some),
-            names[some],
+            numbers[some],
             log_weights,
             directions,
             centres[some],
-            width * variances[informed].clamp(min=1e-9).sqrt(),
+            width * variances[informed].sqrt(),
         )
 
     def draw(self, number: int) -> dict[str, Tensor]:
@@ -226,12 +234,12 @@ class Kernels:
             values[site] = torch.where(anyhow, other, self.points[site][centre])
         return values
 
-    def log_density(self, values: Mapping[str, Tensor], names: Tensor) -> Tensor:
+    def log_density(self, values: Mapping[str, Tensor], numbers: Tensor) -> Tensor:
         """Log density ``[M]`` of values ``[M, ...]`` without their own kernels.
 
         Args:
             values: of points.
-            names: their numbers ``[M]``.
+            numbers: of the points among all that were ever drawn ``[M]``.
         """
         white = self.whitening.whiten(values)
         own = white @ self.directions
@@ -239,26 +247,14 @@ class Kernels:
         for site, support in self.whitening.coordinates.supports.items():
             same = values[site][:, None] == self.points[site]
             found = found + (ANYHOW / len(support) + (1 - ANYHOW) * same.double()).log()
-        own_kernel = names[:, None] == self.names
+        own_kernel = numbers[:, None] == self.numbers
         weights = self.log_weights.expand(own_kernel.shape).masked_fill(own_kernel, -torch.inf)
-        near = (found + weights.log_softmax(-1)).logsumexp(-1) - self.spread.log().sum()
+        # Of a single kernel nothing is left.
+        weights = weights.log_softmax(-1).nan_to_num(nan=-torch.inf)
+        near = (found + weights).logsumexp(-1) - self.spread.log().sum()
         others = (own.square().sum(-1) - white.square().sum(-1)) / 2
         constant = white.shape[-1] * math.log(2 * math.pi) / 2
         return near + others - constant + self.whitening.log_abs_det(values)
-
-
-def tempered(log_weights: Tensor, effective: float) -> Tensor:
-    """Temper log weights ``[n]`` until this many, at most half of them, are effective."""
-    effective = min(effective, len(log_weights) / 2)
-    low, high = 0.0, 1.0
-    if float(1 / torch.softmax(log_weights, 0).square().sum()) < effective:
-        for _ in range(30):
-            power = (low + high) / 2
-            weights = torch.softmax(power * log_weights, 0)
-            enough = float(1 / weights.square().sum()) >= effective
-            low, high = (power, high) if enough else (low, power)
-        high = low
-    return torch.log_softmax(high * log_weights, 0)
 
 
 @torch.no_grad()
@@ -273,47 +269,53 @@ def with_points_near(
 
     Args:
         builder: views of one person's rounds under points from the prior.
-        found: weighted draws given these, few are enough.
+        found: weighted draws given these; few are enough.
         rounds: all rounds of the person.
         screening: when to drop points.
-        options: settings of importance sampling.
+        options: settings of importance sampling; as many points should be effective as draws.
 
     Returns:
         Views and weighted draws of the last stage. Their Pareto k is the larger one of those of
         draws and of points.
     """
-    human = builder.human
+    human, device = builder.human, builder.alive.device
     prior = PriorPoints.of(human)
     whitening = Whitening.of(Coordinates.of(human, builder.grid), builder.grid)
-    names, drawn = torch.arange(builder.grid.number), builder.grid.number
-    from_prior, others = builder.grid.number, []
+    drawn = from_prior = builder.grid.number
+    numbers, kernels = torch.arange(drawn, device=device), []
+    near_prior = round(FROM_PRIOR * NEW_POINTS)
     for _ in range(STAGES):
         points, probability = found.combination_probabilities()
-        if 1 / float(probability.square().sum()) >= ENOUGH:
+        if 1 / float(probability.square().sum()) >= options.enough:
             break
-        near = builder.grid.chosen(points)
-        others.append(Kernels.around(whitening, near, names[points], probability))
+        own = Kernels.around(whitening, builder.grid.chosen(points), numbers[points], probability)
+        kernels.append(own)
         order = probability.argsort(descending=True)
         most = points[order[probability[order].cumsum(0) - probability[order] < 1 - NEGLIGIBLE]]
-        kept, names = builder.grid.chosen(most), names[most]
-        anybody = round(FROM_PRIOR * NEW_POINTS)
-        new = prior.values(anybody, int(torch.randint(2**31, ())))
-        near = others[-1].draw(NEW_POINTS - anybody)
-        values = {site: torch.cat([kept[site], new[site], near[site]]) for site in kept}
-        names = torch.cat([names, drawn + torch.arange(NEW_POINTS)])
-        drawn, from_prior = drawn + NEW_POINTS, from_prior + anybody
+        parts = (
+            builder.grid.chosen(most),
+            prior.values(near_prior, int(torch.randint(2**31, ()))),
+            own.draw(NEW_POINTS - near_prior),
+        )
+        values = {site: torch.cat([part[site] for part in parts]) for site in builder.grid}
+        new = torch.arange(drawn, drawn + NEW_POINTS, device=device)
+        numbers = torch.cat([numbers[most], new])
+        drawn, from_prior = drawn + NEW_POINTS, from_prior + near_prior
         each = [math.log(from_prior) + prior.log_density(values).double()]
-        each += [math.log(NEW_POINTS - anybody) + one.log_density(values, names) for one in others]
+        each += [
+            math.log(NEW_POINTS - near_prior) + one.log_density(values, numbers) for one in kernels
+        ]
         density = torch.stack(each).logsumexp(0).to(prior.like)
-        grid = Grid(values, log_proposal=density, read=kept.read)
+        grid = Grid(values, log_proposal=density, read=builder.grid.read)
         builder = ViewTableBuilder(human, screening, grid=grid)
         for some in rounds:
             builder.add(some)
         found = sample_importance(human, builder.table(), coarse(options), found)
     found = sample_importance(human, builder.table(), options, found)
     points, probability = found.combination_probabilities()
-    # Weights of points from the prior alone are likelihoods, which are bounded.
-    _, of_points = pareto_smoothed(probability.log()) if others else (None, -math.inf)
+    # Weights of points from the prior are likelihoods, which are bounded.
+    bounded = prior.is_prior and not kernels
+    of_points = -math.inf if bounded else pareto_smoothed(probability.log())[1]
     return builder, replace(
         found,
         pareto_k=max(found.pareto_k, of_points),

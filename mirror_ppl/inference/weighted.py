@@ -27,7 +27,7 @@ class Weighted:
 
     Attributes:
         policy: values of the sites that perception does not read, ``[S, 1, 1, ...]``.
-        combinations: possible combinations of the discrete sites that it reads; G sets.
+        combinations: possible combinations of the sites that it reads; G sets.
         log_joint: log joint probability of each of these sets and the recorded actions under each
             draw, ``[S, G]``, up to a common constant.
         log_weights: normalized and Pareto-smoothed, ``[S]``.
@@ -70,7 +70,7 @@ class Weighted:
         chance = sets.share.double().diff(prepend=sets.share.new_zeros(1).double())
         which = torch.arange(len(sets), device=chance.device).repeat_interleave(sets.sizes)
         total = torch.zeros_like(self._of_sets).index_add(0, which, chance)
-        found = (self._of_sets / total)[which] * chance
+        found = (self._of_sets / total.clamp(min=torch.finfo(total.dtype).tiny))[which] * chance
         return sets.members, found / found.sum()
 
     @property
@@ -88,17 +88,7 @@ class Weighted:
         The power is 1 if possible.
         """
         effective = min(effective, len(self.log_weights) / 4)
-        if self.effective >= effective:
-            return self
-        low, high = 2.0**-HALVINGS, 1.0
-        for _ in range(HALVINGS):
-            power = (low + high) / 2
-            weights = torch.softmax(power * self.log_weights, 0)
-            if float(1 / weights.square().sum()) >= effective:
-                low = power
-            else:
-                high = power
-        return replace(self, log_weights=torch.log_softmax(low * self.log_weights, 0))
+        return replace(self, log_weights=tempered(self.log_weights, effective))
 
     def sample(self, number: int, values: Mapping[str, Tensor]) -> Draws:
         """Joint draws ``[number, 1, 1, ...]`` of all sites from the global random state.
@@ -118,3 +108,23 @@ class Weighted:
         drawn = self.combinations.draw(chosen.clamp(max=ladder.shape[-1] - 1).squeeze(-1))
         perceived = {site: value[drawn][:, None, None] for site, value in values.items()}
         return {name: value[place] for name, value in self.policy.items()} | perceived
+
+
+def tempered(log_weights: Tensor, effective: float) -> Tensor:
+    """Raise normalized weights ``[n]`` to a power at which this many are effective; 1 if possible.
+
+    Args:
+        log_weights: their logarithms.
+        effective: the effective number, less than n.
+    """
+    if float(1 / log_weights.exp().square().sum()) >= effective:
+        return log_weights
+    low, high = 2.0**-HALVINGS, 1.0
+    for _ in range(HALVINGS):
+        power = (low + high) / 2
+        weights = torch.softmax(power * log_weights, 0)
+        if float(1 / weights.square().sum()) >= effective:
+            low = power
+        else:
+            high = power
+    return torch.log_softmax(low * log_weights, 0)

@@ -34,6 +34,11 @@ from mirror_ppl.user_code import is_of_package
 
 MAX_COMBINATIONS = 100_000
 """Largest number of combinations that are all summed over."""
+NOT_SUMMED = (
+    "perceive() reads a continuous site, or too many discrete ones to sum over all their "
+    "combinations"
+)
+"""Why a model needs points, for messages."""
 
 
 def discrete_sites(human: HumanModel) -> dict[str, Tensor]:

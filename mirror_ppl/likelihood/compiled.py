@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.errors import HumanModelError, InputError
-from mirror_ppl.likelihood.combinations import discrete_sites, needs_points
+from mirror_ppl.likelihood.combinations import NOT_SUMMED, discrete_sites, needs_points
 from mirror_ppl.likelihood.densities import PLATES, Given, log_prob, power_of
 from mirror_ppl.likelihood.enumeration import acts_on_beliefs, draw_combinations, log_joints
 from mirror_ppl.likelihood.predictive import predict_actions
@@ -386,9 +386,7 @@ def compile(  # noqa: A001 - the word for it
         return Sequential(observed, rounds)
     if needs_points(human):
         raise HumanModelError(
-            "perceive() reads a continuous site, or too many discrete ones to sum over all their "
-            "combinations; svi and nuts follow gradients, which what is seen has not, so only "
-            "importance fits this"
+            f"{NOT_SUMMED}; what is seen has no gradient, which svi and nuts need: use importance"
         )
     builders, tables = [], []
     for builder in person_builders(human, rounds, screening, likely, report=report):

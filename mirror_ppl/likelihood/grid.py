@@ -50,6 +50,11 @@ class Grid(Mapping[str, Tensor]):
         return len(self.by_site)
 
     @property
+    def is_points(self) -> bool:
+        """True for points, False for all combinations."""
+        return self.sizes is None
+
+    @property
     def number(self) -> int:
         """The number of joint values M."""
         return (

@@ -9,40 +9,45 @@ adds others where the posterior is.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.combinations import (
-    discrete_sites,
+    NOT_SUMMED,
     log_sampled,
     needs_points,
     perceived_names,
     perceived_sites,
 )
 from mirror_ppl.likelihood.grid import Grid, grid_of
-from mirror_ppl.models.dependencies import dependencies
+from mirror_ppl.models.dependencies import Dependencies, dependencies
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.prior import Draws, draw_prior
+from mirror_ppl.models.prior import Draws, draw_prior, sample_sites, values_of
+from mirror_ppl.randomness import forked, seed_everything
 
 FIRST_POINTS = 8192
 """Points that are drawn from the prior."""
-CONDITIONS = 64
+CONDITIONS = 512
 """Draws of other sites on which the prior of points depends."""
 
 
 def whole_grid(human: HumanModel, seed: int = 0) -> Grid:
     """The joint values that engines sum over: all combinations, or points from the prior.
 
+    The first points of all people are the same, so that errors of their evidences have a common
+    part.
+
     Args:
         human: the model of people.
         seed: of points.
 
     Raises:
-        HumanModelError: perception reads a discrete site whose values are not 0, 1 and so on, or a
-            continuous one that actions or other sites depend on, too.
+        HumanModelError: perception reads a discrete site whose values are not 0, 1 and so on, or
+            points are needed and ``act`` reads a site that perception reads.
     """
     if not needs_points(human):
         return grid_of(perceived_sites(human))
@@ -53,8 +58,9 @@ def whole_grid(human: HumanModel, seed: int = 0) -> Grid:
 class PriorPoints:
     """The distribution from which the first points are drawn.
 
-    It is the prior of the sites that perception reads and of all on which these depend. Where these
-    depend on a site that ``act`` reads, too, it is a mixture of conditional priors.
+    It is the prior of the sites that perception reads, and of all on which these alone depend. If
+    they depend on sites that other parts of the program read, too, it is the mean of their priors
+    given draws of those.
 
     Attributes:
         human: the model of people.
@@ -74,35 +80,28 @@ class PriorPoints:
         """Find the points' sites.
 
         Raises:
-            HumanModelError: ``act`` reads a continuous site that perception reads, or attention is
-                sampled.
+            HumanModelError: ``act`` reads a site that perception reads, or attention is sampled.
         """
         if human.has_round_latents and not human.chained:
-            raise HumanModelError(
-                "perceive() reads a continuous site, or too many discrete ones to sum over all "
-                "their combinations, and round_latents has no spans: declare them"
-            )
+            raise HumanModelError(f"{NOT_SUMMED}, and round_latents has no spans: declare them")
         found, read = dependencies(human), perceived_names(human)
-        if both := set(read) & found.actions - discrete_sites(human).keys():
-            names = ", ".join(sorted(both))
+        if both := set(read) & found.actions:
             raise HumanModelError(
-                f"act() reads a continuous site that perceive() reads, too ({names}), which no "
-                "engine can infer; sample two sites, and let the one that perceive() reads depend "
-                "on the other"
+                f"act() reads a site that perceive() reads, too ({', '.join(sorted(both))}), which "
+                "no engine can infer where perceive() reads a continuous site, or too many "
+                "discrete ones; sample two sites, and let the one that perceive() reads depend on "
+                "the other"
             )
-        sites = set(read)
-        outside = False
-        waiting = list(read)
-        while waiting:
-            for parent in found.prior[waiting.pop()] & found.latent:
-                if parent in found.actions and parent not in sites:
-                    outside = True
-                elif parent not in sites:
-                    sites.add(parent)
-                    waiting.append(parent)
-        others = draw_prior(human, 1, CONDITIONS if outside else 1, CONDITIONS)
+        sites = _with_parents(found, read)
+        depends = any(found.prior[site] & found.latent - sites for site in sites)
+        others = draw_prior(human, 1, CONDITIONS if depends else 1, CONDITIONS)
         given = {name: value for name, value in others.items() if name not in sites}
         return cls(human, tuple(name for name in others if name in sites), read, given)
+
+    @property
+    def is_prior(self) -> bool:
+        """True if this is the prior itself, whatever the other sites are."""
+        return len(next(iter(self.given.values()), (0,))) == 1
 
     @property
     def like(self) -> Tensor:
@@ -111,8 +110,12 @@ class PriorPoints:
 
     def values(self, number: int, seed: int) -> dict[str, Tensor]:
         """Draw values ``[number, ...]``, deterministic given the seed."""
-        own = draw_prior(self.human, 1, number, seed)
-        return {name: own[name][:, 0, 0] for name in self.sites}
+        with forked():
+            seed_everything(seed)
+            which = torch.randint(len(next(iter(self.given.values()), (0,))), (number,))
+            given = {name: value[which] for name, value in self.given.items()}
+            drawn = values_of(sample_sites(self.human, 1, number, given))
+        return {name: drawn[name][:, 0, 0] for name in self.sites}
 
     def log_density(self, values: Mapping[str, Tensor]) -> Tensor:
         """Log density ``[M]`` of values ``[M, ...]``."""
@@ -127,3 +130,18 @@ class PriorPoints:
             log_proposal=self.log_density(values) + math.log(number),
             read=self.read,
         )
+
+
+def _with_parents(found: Dependencies, read: Sequence[str]) -> set[str]:
+    """Sites that perception reads, and those on which these alone depend."""
+    sites, waiting = set(read), list(read)
+    while waiting:
+        parents = found.prior[waiting.pop()] & found.latent - sites
+        sites |= parents
+        waiting += parents
+    while True:
+        elsewhere = set(found.actions).union(*found.round_latents.values())
+        elsewhere = elsewhere.union(*(found.prior[site] for site in found.latent - sites))
+        if not (others := (sites - set(read)) & elsewhere):
+            return sites
+        sites -= others

@@ -19,10 +19,11 @@ from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.inference import point_proposals
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.online import OnlinePosterior
-from mirror_ppl.inference.point_proposals import Coordinates, Kernels, Whitening, tempered
+from mirror_ppl.inference.point_proposals import Coordinates, Kernels, Whitening
 from mirror_ppl.inference.results.identifiability import identify
 from mirror_ppl.inference.results.posterior_predictive import predict_rounds
-from mirror_ppl.likelihood.combinations import needs_points, perceived_names
+from mirror_ppl.inference.weighted import tempered
+from mirror_ppl.likelihood.combinations import log_priors, needs_points, perceived_names
 from mirror_ppl.likelihood.compiled import Sequential
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.grid import Grid
@@ -246,6 +247,96 @@ def test_the_planner_predicts_as_the_program_does(in_cells, recordings):
         past = past.then(told, one.actions[0, 0, step], following)
 
 
+class Rare(Vector):
+    """Far reaches are as rare as the instance says."""
+
+    beyond = 0.0
+
+    def place(self, implants):
+        return super().place(implants) - self.beyond + CUTS[3]
+
+
+@pytest.mark.parametrize("beyond", [1, 2, 6, 20, 200])
+def test_few_of_the_first_points_suffice(beyond, toy, played):
+    """Sites of twelve numbers, of which so many of the first points explain the rounds."""
+    human = Rare(toy.self_model)
+    first = whole_grid(human)["far"].sum(-1) / math.sqrt(12)
+    human.beyond = float(first.double().sort().values[-beyond] - 1e-6)
+    found = infer(human, played, InferenceOptions("importance", 200), 0)
+    edges = [-math.inf, *(CUTS - CUTS[3] + human.beyond).tolist(), math.inf]
+    prior = torch.tensor(stats.norm.cdf(edges)).diff()
+    exact = float((prior * likelihoods(toy, played)).sum().log())
+    error = float(found.evidence_error[0])
+    assert error < 0.15
+    assert abs(float(found.log_evidence[0]) - exact) < 4 * error + 0.05
+    assert float(found.pareto_k[0]) < 0.7
+
+
+class Many(Far):
+    """Discrete sites with 160,000 combinations, of which the sum counts."""
+
+    def prior(self):
+        uniform = dist.Categorical(torch.ones(20) / 20)
+        return self.rates() | {name: pyro.sample(name, uniform) for name in "abcd"}
+
+    def place(self, implants):
+        total = sum(implants[name] for name in "abcd")
+        return CUTS[(total.clamp(70, 75) - 70).long()] - 1e-3
+
+
+def test_too_many_combinations_are_inferred(toy, played):
+    human = Many(toy.self_model)
+    found = infer(human, played, InferenceOptions("importance", 500), 0)
+    one = torch.ones(20, dtype=torch.double) / 20
+    total = one
+    for _ in range(3):
+        total = torch.nn.functional.conv1d(total[None, None], one[None, None], padding=19)[0, 0]
+    prior = torch.cat([total[:71].sum()[None], total[71:75], total[75:].sum()[None]])
+    exact = (prior * likelihoods(toy, played)[:6]).sum().log()
+    # Combinations that no point has are missed, beyond the error that is said.
+    error = float(found.evidence_error[0])
+    assert error < 0.15
+    assert abs(float(found.log_evidence[0]) - float(exact)) < 4 * error + 0.1
+
+
+@pytest.mark.parametrize("spread", [1.0, 0.1, 0.03])
+@torch.no_grad()
+def test_first_points_are_drawn_from_the_density_that_divides_them(spread, toy):
+    """Their mean weight, the prior's density relative to it, is 1."""
+
+    class Narrow(Able):
+        def prior(self):
+            implants = self.rates()
+            far = dist.Normal(2 * implants["in_sight"] - 1, spread)
+            return implants | {"far": pyro.sample("far", far)}
+
+    human = Narrow(toy.self_model)
+    others = {n: v for n, v in draw_prior(human, 1, 400, 7).items() if n != "far"}
+    weights = log_priors(human, whole_grid(human), others, 1)[:, 0].exp().sum(-1)  # [S]
+    assert abs(float(weights.mean()) - 1) < 4 * float(weights.std()) / 20 + 0.01
+
+
+class Shared(Far):
+    """A site above what is seen and above another site stays out of the points."""
+
+    def prior(self):
+        mood = pyro.sample("mood", dist.Normal(0.0, 1.0))
+        other = pyro.sample("other", dist.Normal(mood, 1.0))
+        far = pyro.sample("far", dist.Normal(0.1 * mood, 1.0))
+        return self.rates() | {"far": far, "other": other}
+
+    def act(self, implants, belief, values):
+        found = super().act(implants, belief, values)
+        return torch.log_softmax(found + 0 * implants["other"][..., None], -1)
+
+
+def test_sites_above_others_too_are_no_points(toy, played):
+    human = Shared(toy.self_model)
+    assert set(whole_grid(human)) == {"far"}
+    found = infer(human, played, InferenceOptions("importance", 20), 0)
+    assert found.draws["mood"].shape == (20, 1, 1)
+
+
 class ReadsConsistency(HumanModel):
     """Perception reads what ``act`` reads."""
 
@@ -284,7 +375,7 @@ class Distracted(HumanModel):
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        (ReadsConsistency, r"act\(\) reads a continuous site that perceive\(\) reads, too \(cons"),
+        (ReadsConsistency, r"act\(\) reads a site that perceive\(\) reads, too \(consistency\)"),
         (Distracted, "round_latents has no spans: declare them"),
     ],
 )
@@ -301,7 +392,7 @@ def test_sites_that_depend_on_what_is_seen_are_refused(toy, played):
 
 @pytest.mark.parametrize("engine", ["svi", "nuts"])
 def test_gradients_are_refused(engine, toy, played):
-    with pytest.raises(HumanModelError, match="only importance fits this"):
+    with pytest.raises(HumanModelError, match="which svi and nuts need: use importance"):
         infer(Far(toy.self_model), played, InferenceOptions(engine, 5), 0)
 
 
