@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,6 +13,7 @@ from mirror_ppl.console import console_for_tables
 from mirror_ppl.errors import OptionError
 from mirror_ppl.inference.names import told_engine
 from mirror_ppl.limits import check_numbers
+from mirror_ppl.models.prior import sites_of_several_numbers
 from mirror_ppl.models.world_knowledge import fit_shipped_world
 from mirror_ppl.progress import Progress
 
@@ -137,7 +139,7 @@ def main(options: Options) -> int:
         drawn = {folder / name: plot(calibration).content() for name, plot in pictures.items()}
         write_together({folder / "calibration.nc": calibration.content(), **drawn})
         runner.clean()
-    _show(calibration, guide)
+    _show(calibration, guide, sites_of_several_numbers(human))
     if counted < 1:
         print(
             f"A decision counts once here and {counted:g} times in fits of this model, whose "
@@ -161,7 +163,7 @@ def _infer(
     return infer(human, recordings, options, seed, network, checked=True)
 
 
-def _show(calibration: Calibration, guide: str) -> None:
+def _show(calibration: Calibration, guide: str, several: Collection[str]) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
@@ -191,6 +193,8 @@ def _show(calibration: Calibration, guide: str) -> None:
             "-" if weights != weights else f"{100 * weights:.0f}%",
         )
     console_for_tables(WIDTH).print(table)
+    if several:
+        print(f"Not tested, as they have several numbers a person: {', '.join(several)}")
     rate = calibration.failure_rate
     verdict = f"rejected for {len(rejected)}" if rejected else "not rejected for any"
     if calibration.people < FEW_PEOPLE:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from math import prod
 from typing import Any
 
 from rich.table import Table
@@ -45,6 +46,9 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
         "median [90% interval] truth, if known"
         + ("; -: of another model than the most probable one" if KIND in sites else ""),
     )
+    if several := summary["several_numbers"]:
+        names = ", ".join(f"{name} ({prod(shape)})" for name, shape in several.items())
+        print(f"Implants of several numbers are in posterior.nc alone: {names}")
     _show_predictions(summary["people"])
     people, wrong = summary["people"], summary["contradictions"]
     print(_served(people))

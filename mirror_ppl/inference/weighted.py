@@ -88,7 +88,8 @@ class Weighted:
         The power is 1 if possible.
         """
         effective = min(effective, len(self.log_weights) / 4)
-        return replace(self, log_weights=tempered(self.log_weights, effective))
+        log_weights = tempered(self.log_weights, effective)
+        return self if log_weights is self.log_weights else replace(self, log_weights=log_weights)
 
     def sample(self, number: int, values: Mapping[str, Tensor]) -> Draws:
         """Joint draws ``[number, 1, 1, ...]`` of all sites from the global random state.

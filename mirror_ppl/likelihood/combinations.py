@@ -34,11 +34,6 @@ from mirror_ppl.user_code import is_of_package
 
 MAX_COMBINATIONS = 100_000
 """Largest number of combinations that are all summed over."""
-NOT_SUMMED = (
-    "perceive() reads a continuous site, or too many discrete ones to sum over all their "
-    "combinations"
-)
-"""Why a model needs points, for messages."""
 
 
 def discrete_sites(human: HumanModel) -> dict[str, Tensor]:
@@ -96,6 +91,16 @@ def needs_points(human: HumanModel) -> bool:
     supports = perceived_sites(human)
     number = prod(len(support) for support in supports.values())
     return bool(set(perceived_names(human)) - supports.keys()) or number > MAX_COMBINATIONS
+
+
+def why_points(human: HumanModel) -> str:
+    """Why a model needs points, for messages."""
+    supports = perceived_sites(human)
+    continuous = [name for name in perceived_names(human) if name not in supports]
+    if continuous:
+        return f"perceive() reads the continuous {', '.join(continuous)}"
+    number = prod(len(support) for support in supports.values())
+    return f"perceive() reads {number:,} combinations of discrete sites, too many to sum over all"
 
 
 _read_by: WeakKeyDictionary[HumanModel, tuple[tuple[str, ...], Sites]] = WeakKeyDictionary()

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.errors import HumanModelError, InputError
-from mirror_ppl.likelihood.combinations import NOT_SUMMED, discrete_sites, needs_points
+from mirror_ppl.likelihood.combinations import discrete_sites, needs_points, why_points
 from mirror_ppl.likelihood.densities import PLATES, Given, log_prob, power_of
 from mirror_ppl.likelihood.enumeration import acts_on_beliefs, draw_combinations, log_joints
 from mirror_ppl.likelihood.predictive import predict_actions
@@ -386,7 +386,8 @@ def compile(  # noqa: A001 - the word for it
         return Sequential(observed, rounds)
     if needs_points(human):
         raise HumanModelError(
-            f"{NOT_SUMMED}; what is seen has no gradient, which svi and nuts need: use importance"
+            f"{why_points(human)}: what is seen has no gradient, which svi and nuts need; fit with "
+            "importance"
         )
     builders, tables = [], []
     for builder in person_builders(human, rounds, screening, likely, report=report):

@@ -96,7 +96,11 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
             for name in set(latents) & set(latent_sites(trace.trace)):
                 raise HumanModelError(f'"{name}" is a site of prior() and of round_latents()')
             own = {name: value[:, 0] for name, value in latent_values(trace.trace).items()}
-            sites = {name: value.expand(people, *value.shape[1:]) for name, value in own.items()}
+            sites = {
+                name: value.expand(people, *value.shape[1:])
+                for name, value in own.items()
+                if name in implants
+            }
             belief = next(human.parameters()).new_zeros(people, human.belief_size)
             method = "nothing_known"
             knowledge: Any = human.nothing_known(people, device=device)

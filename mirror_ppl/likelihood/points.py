@@ -17,11 +17,11 @@ from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.combinations import (
-    NOT_SUMMED,
     log_sampled,
     needs_points,
     perceived_names,
     perceived_sites,
+    why_points,
 )
 from mirror_ppl.likelihood.grid import Grid, grid_of
 from mirror_ppl.models.dependencies import Dependencies, dependencies
@@ -83,14 +83,15 @@ class PriorPoints:
             HumanModelError: ``act`` reads a site that perception reads, or attention is sampled.
         """
         if human.has_round_latents and not human.chained:
-            raise HumanModelError(f"{NOT_SUMMED}, and round_latents has no spans: declare them")
+            raise HumanModelError(
+                f"{why_points(human)}, and round_latents has no spans: declare them"
+            )
         found, read = dependencies(human), perceived_names(human)
         if both := set(read) & found.actions:
             raise HumanModelError(
-                f"act() reads a site that perceive() reads, too ({', '.join(sorted(both))}), which "
-                "no engine can infer where perceive() reads a continuous site, or too many "
-                "discrete ones; sample two sites, and let the one that perceive() reads depend on "
-                "the other"
+                f"act() reads a site that perceive() reads, too ({', '.join(sorted(both))}), and "
+                f"{why_points(human)}, which no engine can infer together; sample two sites, and "
+                "let the one that perceive() reads depend on the other"
             )
         sites = _with_parents(found, read)
         depends = any(found.prior[site] & found.latent - sites for site in sites)

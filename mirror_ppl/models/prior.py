@@ -16,6 +16,7 @@ from torch.distributions.constraints import Constraint
 from mirror_ppl.checks import as_tensor, require_kind, seed_number, whole_number
 from mirror_ppl.errors import HumanModelError, InputError, shown
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.implants import RESIDUAL
 from mirror_ppl.models.sites import latent_sites
 from mirror_ppl.randomness import forked, person_seed, seed_everything
 
@@ -177,6 +178,16 @@ def scalar_sites(human: HumanModel) -> dict[str, Any]:
             name: biject_to(node["fn"].support)
             for name, node in sample_sites(human, 1).items()
             if not node["fn"].has_enumerate_support and node["fn"].event_dim == 0
+        }
+
+
+def sites_of_several_numbers(human: HumanModel) -> dict[str, list[int]]:
+    """Return the shapes of sites of several numbers, but for the weights of the residual."""
+    with forked():
+        return {
+            name: list(node["fn"].event_shape)
+            for name, node in sample_sites(human, 1).items()
+            if node["fn"].event_dim and name not in RESIDUAL
         }
 
 

@@ -64,8 +64,8 @@ class Readable(Mapping[str, Tensor]):
     def __getitem__(self, name: str) -> Tensor:
         if name not in self.known:
             raise HumanModelError(
-                f'perceive() reads "{name}", which is no site of prior() or round_latents(); it '
-                f"can read: {', '.join(self.known) or 'none'}"
+                f'perceive() reads "{name}", which is no site that prior() or round_latents() '
+                f"returns; it can read: {', '.join(self.known) or 'none'}"
             )
         self.read.add(name)
         return self.known[name]

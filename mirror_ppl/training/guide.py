@@ -35,7 +35,7 @@ from mirror_ppl.inference.amortized_guide import (
 from mirror_ppl.inference.calibration.study import prior_people
 from mirror_ppl.inference.engines import run_identity
 from mirror_ppl.inference.hierarchical_proposal import dependent_sites
-from mirror_ppl.likelihood.combinations import NOT_SUMMED, needs_points, perceived_names
+from mirror_ppl.likelihood.combinations import needs_points, perceived_names, why_points
 from mirror_ppl.likelihood.densities import require_compilable
 from mirror_ppl.likelihood.enumeration import require_acting_on_beliefs
 from mirror_ppl.likelihood.tables import rounds_of
@@ -132,7 +132,7 @@ def train_guide(
     require_compilable(human)
     if needs_points(human):
         raise HumanModelError(
-            f"{NOT_SUMMED}: the network cannot learn such models, which importance fits"
+            f"{why_points(human)}, which the network cannot learn; importance fits it without"
         )
     require_acting_on_beliefs(human, perceived_names(human))
     examples = simulate_examples(human, options, seed, report, checkpoint)

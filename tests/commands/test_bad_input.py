@@ -131,7 +131,10 @@ class Dreamer(HumanModel):
         (("--human-model", "mine.py:Mine"), "no class Mine derived from"),
         (("--human-model", "mine.py:NoHuman"), "it has: Numb, Dreamer"),
         (("--human-model", "mine.py:Numb"), "they do not sum to 1"),
-        (("--human-model", "mine.py:Dreamer"), 'perceive() reads "lapse"'),
+        (
+            ("--human-model", "mine.py:Dreamer"),
+            "act() reads a site that perceive() reads, too (lapse)",
+        ),
         (("--out", "some.nc/out"), "cannot create the folder some.nc/out: Not a directory"),
         (("--out", "some.nc"), "cannot create the folder some.nc: Not a directory"),
     ],

@@ -33,6 +33,8 @@ SITES = tuple(SIGHT + direction for direction in Highway.directions)
 MOST_PEOPLE = 12
 """Maximum number of people on one picture."""
 COLUMNS = 4
+LEAST_WIDTH = 5.8
+"""Inches that the caption takes."""
 
 
 def has_sight(data: az.InferenceData) -> bool:
@@ -75,7 +77,8 @@ def sight_picture(data: az.InferenceData) -> Picture:
     shown = everybody[:MOST_PEOPLE]
     columns = min(COLUMNS, len(shown))
     rows = math.ceil(len(shown) / columns)
-    figure = Picture(figsize=(2.7 * columns + 0.4, 2.8 * rows + 1.6), layout="constrained")
+    width = max(2.7 * columns, LEAST_WIDTH)  # else words are cut off
+    figure = Picture(figsize=(width + 0.4, 2.8 * rows + 1.6), layout="constrained")
     grid = figure.subplots(
         rows, columns, squeeze=False, subplot_kw={"projection": "polar"}
     ).flatten()

@@ -26,6 +26,7 @@ from mirror_ppl.limits import return_memory
 from mirror_ppl.models.family import KIND, OneOfKinds
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import in_units
+from mirror_ppl.models.prior import sites_of_several_numbers
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.simulation import OWN_HUMAN_MODEL, OWN_SIGHT
 from mirror_ppl.models.weights import fingerprint
@@ -215,6 +216,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         "prior_conflicts": None
         if pooling != "none"
         else prior_conflicts(human, posterior.draws, learned.round_counts, seed),
+        "several_numbers": sites_of_several_numbers(human),
         "people": found,
     }
     summary |= newcomer
