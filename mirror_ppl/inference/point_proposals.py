@@ -31,6 +31,8 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.randomness import forked
 
+ENOUGH = 200.0
+"""Effective points, or draws if fewer are enough, at which no stage is added."""
 STAGES = 6
 """Largest number of stages after the first."""
 NEW_POINTS = 4096
@@ -272,7 +274,7 @@ def with_points_near(
         found: weighted draws given these; few are enough.
         rounds: all rounds of the person.
         screening: when to drop points.
-        options: settings of importance sampling; as many points should be effective as draws.
+        options: settings of importance sampling.
 
     Returns:
         Views and weighted draws of the last stage. Their Pareto k is the larger one of those of
@@ -286,7 +288,7 @@ def with_points_near(
     near_prior = round(FROM_PRIOR * NEW_POINTS)
     for _ in range(STAGES):
         points, probability = found.combination_probabilities()
-        if 1 / float(probability.square().sum()) >= options.enough:
+        if 1 / float(probability.square().sum()) >= min(ENOUGH, options.enough):
             break
         own = Kernels.around(whitening, builder.grid.chosen(points), numbers[points], probability)
         kernels.append(own)
