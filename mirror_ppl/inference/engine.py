@@ -84,8 +84,8 @@ class Job:
         draws: number of posterior draws S of each person.
         settings: settings of the engine, see :attr:`Engine.settings`.
         seed: seed of all random draws.
-        screening: when to drop combinations of discrete sites and to merge moments; ``None`` for
-            never.
+        screening: when to drop combinations of what perception reads and to merge moments;
+            ``None`` for never.
         network: network of the amortized guide, if there is one.
         report: called with progress.
         checkpoint: a file that is written during the run and resumed from if it exists, and the

@@ -1,7 +1,7 @@
 """Registry of the engines, and ``infer``, which runs any of them.
 
 All engines target the posterior of the human program, and return joint draws of all its sites.
-Those that compile the program sum the discrete sites that perception reads out exactly.
+Those that compile the program sum out the sites that perception reads.
 """
 
 from __future__ import annotations
@@ -87,8 +87,8 @@ class InferenceOptions:
         draws: number of posterior draws S of each person.
         settings: settings of the engine, such as
             :class:`~mirror_ppl.inference.ImportanceOptions`; by default its own.
-        screening: when to drop combinations of discrete sites and to merge moments; ``None`` for
-            never. With a network it has no effect, as the amortized guide has its own.
+        screening: when to drop combinations of what perception reads and to merge moments;
+            ``None`` for never. With a network it has no effect, as the amortized guide has its own.
         pooling: ``none``, or ``partial`` to infer the population together with the people
             (:mod:`mirror_ppl.inference.population.pooling`).
         refine: gradient steps on each person's rounds that refine the network's proposal.

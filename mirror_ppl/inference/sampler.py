@@ -4,10 +4,9 @@ With draws ``psi_s ~ q`` of a person::
 
     w_s = p(psi_s) sum_m p(m | psi_s) p(actions | m, psi_s) / q(psi_s)
 
-where ``m`` runs over all combinations of the discrete sites that perception reads, and densities
-are those of the program with its observed sites, scales and factors. ``q`` is the mixture of all
-proposals (Veach and Guibas, *Optimally combining sampling techniques for Monte Carlo rendering*,
-1995), so that weights are bounded. Pareto k diagnoses whether there are enough draws (Vehtari,
+where ``m`` runs over all joint values of the sites that perception reads, and densities are those
+of the program with its observed sites, scales and factors. ``q`` is the mixture of all proposals
+(Veach and Guibas, *Optimally combining sampling techniques for Monte Carlo rendering*, 1995), so that weights are bounded. Pareto k diagnoses whether there are enough draws (Vehtari,
 Simpson, Gelman, Yao and Gabry, *Pareto smoothed importance sampling*, 2015).
 """
 
@@ -110,7 +109,7 @@ class Sampler:
         HumanModelError: percepts affect actions other than through beliefs.
 
     Attributes:
-        combinations: the combinations of discrete sites that are still possible.
+        combinations: the combinations of what perception reads that are still possible.
         place: the scalar sites of all draws, in unconstrained space ``[S, D]``.
         supports: supports of the discrete sites of the policy ``[n]``.
     """

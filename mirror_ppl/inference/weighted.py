@@ -15,8 +15,7 @@ from mirror_ppl.models.prior import Draws
 HIGH_PARETO_K = 0.7
 """Pareto k above which importance weights are unreliable (Vehtari et al., 2015)."""
 NEGLIGIBLE = 1e-4
-"""Posterior probability of the combinations of discrete sites that `Weighted.probable` leaves out.
-"""
+"""Posterior probability of the combinations that `Weighted.probable` leaves out."""
 HALVINGS = 20
 """Bisection steps for the power to which weights are raised."""
 

@@ -32,7 +32,7 @@ def chained_views(
 
     Args:
         human: the model of people; its attention is :attr:`HumanModel.chained`.
-        combinations: values ``[M]`` of the discrete implants.
+        combinations: values ``[M, ...]`` of the sites of ``prior`` that perception reads.
         number: number of combinations M.
         rounds: rounds of one person.
 
@@ -91,7 +91,7 @@ class _RoundWays:
     Attributes:
         round: number of the round.
         supports: supports of the sites of attention ``[n]``.
-        combinations: values ``[M]`` of the discrete implants.
+        combinations: values ``[M, ...]`` of the sites of ``prior`` that perception reads.
         spans: spans of the sites of attention.
         steps: number of steps of the round.
         covariates: covariates of the round ``[1, 1]``.

@@ -1,4 +1,4 @@
-"""Sets of combinations of discrete implants that have the same view of every round.
+"""Sets of combinations of what perception reads that have the same view of every round.
 
 The recordings do not distinguish them: they have the same likelihood, so within a set the posterior
 is proportional to the prior. After few rounds there are far fewer sets than combinations.
@@ -31,7 +31,7 @@ def fixed_prior(human: HumanModel, grid: Mapping[str, Tensor]) -> Tensor | None:
 
     Args:
         human: the model of people.
-        grid: values ``[M]`` of the discrete sites that perception reads.
+        grid: values ``[M, ...]`` of the sites that perception reads.
     """
     found = dependencies(human)
     for name, parents in found.prior.items():

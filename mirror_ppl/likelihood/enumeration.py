@@ -1,6 +1,6 @@
 """Exact posteriors over the perceptual implants, given the policy implants.
 
-Enumerates all combinations of the discrete sites that perception depends on, each with its prior
+Enumerates all joint values of the sites that perception reads, each with its prior
 and likelihood, without sampling or optimization: the reference for every approximate guide.
 """
 
@@ -98,7 +98,7 @@ def expected_counts(
         table: views of one person's rounds.
         draws: values of the other sites ``[S, 1, 1, ...]``.
         log_weights: log weights of the draws, ``[S]``.
-        combinations: possible combinations of the discrete sites, ``[G]``.
+        combinations: possible combinations of what perception reads, ``[G]``.
         log_prior: log prior of these ``[G]``, if it does not depend on the other sites.
     """
     number = len(log_weights)

@@ -1,7 +1,7 @@
 """Policies near a person: prior draws under which the rounds so far are most probable.
 
-If no policy resembles the person, another can fit them best by chance, with wrong values of the
-discrete implants, and screening would drop the right ones. A few prior draws often miss a person;
+If no policy resembles the person, another can fit them best by chance, with wrong values of what
+perception reads, and screening would drop the right ones. A few prior draws often miss a person;
 among many, some resemble them.
 """
 
@@ -36,7 +36,7 @@ class LikelyPolicies:
 
     Args:
         human: the model of people, without round latents and ``stratified_by``.
-        grid: values ``[M]`` of the discrete sites that perception reads, for each combination.
+        grid: values ``[M, ...]`` of the sites that perception reads, for each combination.
         seed: seed of the prior draws.
 
     Attributes:

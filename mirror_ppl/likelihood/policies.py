@@ -35,7 +35,7 @@ def draw_policies(
 
     Args:
         human: the model of people.
-        grid: values ``[M]`` of the discrete sites that perception reads, for each combination.
+        grid: values ``[M, ...]`` of the sites that perception reads, for each combination.
         number: number of policies S.
         seed: seed of the draws.
         distinct: True for no draw twice, and for fewer policies if there are not as many draws.

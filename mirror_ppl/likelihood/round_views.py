@@ -204,7 +204,7 @@ def views_of_rounds(
 
     Args:
         human: the model of people.
-        implants: combinations of values ``[n]`` of the discrete sites that perception reads.
+        implants: joint values ``[n, ...]`` of the sites that perception reads.
         row: the round that each combination sees ``[n]``.
         rounds: rounds of one person.
     """

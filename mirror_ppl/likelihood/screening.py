@@ -1,4 +1,4 @@
-"""Settings of screening: when combinations of discrete implants are dropped."""
+"""Settings of screening: when combinations of what perception reads are dropped."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mirror_ppl.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class Screening:
-    """Settings of screening, which drops combinations of discrete implants during compilation.
+    """Settings of screening, which drops combinations of what perception reads during compilation.
 
     Attributes:
         margin: nats by which a combination's log-likelihood may fall behind the best one's, each

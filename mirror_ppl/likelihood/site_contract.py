@@ -90,8 +90,11 @@ def check_sites(trace: poutine.Trace, people: int) -> None:
                 f'"{name}" has batch shape {tuple(fn.batch_shape)}, expected ({people}, 1) for '
                 f"{people} people; use .to_event() for several numbers a person"
             )
-        bounds = [bound for bound in vars(fn.support).values() if torch.is_tensor(bound)]
-        if not fn.event_dim and any(bool((bound != bound.flatten()[0]).any()) for bound in bounds):
+        support = getattr(fn.support, "base_constraint", fn.support)  # of .to_event()
+        bounds = [bound for bound in vars(support).values() if torch.is_tensor(bound)]
+        batch = len(fn.event_shape)  # bounds may differ between the numbers of a person
+        of_people = [one.flatten(0, -1 - batch) for one in bounds if one.dim() > batch]
+        if any(bool((one != one[:1]).any()) for one in of_people):
             raise HumanModelError(
                 f'what "{name}" can be depends on another site; sample it from 0 to 1, say, and '
                 "stretch it where it is read"

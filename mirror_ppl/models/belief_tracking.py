@@ -41,7 +41,7 @@ class Transition:
     """The inputs of one step: implants, action, observation and messages.
 
     Attributes:
-        implants: values ``[n]`` of the discrete sites.
+        implants: values ``[n, ...]`` of the sites that perception reads.
         action: the action in between ``[n]``; the number of actions at the start of a round.
         observation: full observations, ``[rows, ...]``.
         told: communicated items, ``[n, K]`` by modality, or ``[1, K]`` for all.

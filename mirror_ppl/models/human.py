@@ -129,8 +129,9 @@ class HumanModel(nn.Module):
     def prior(self) -> dict[str, Tensor]:
         """Sample the implants of every person; runs inside ``pyro.plate("person", P, dim=-2)``.
 
-        Discrete sites with finite support are marginalized exactly, all others get an automatic
-        guide. Returns values by name, for :meth:`perceive` and :meth:`act`.
+        Discrete sites with finite support are summed out exactly, others that perception reads by
+        weighted points, and the rest is proposed. Returns values by name, for :meth:`perceive` and
+        :meth:`act`.
         """
         like = next(self.self_model.parameters())
         return implant_priors.perceptual_implants(
@@ -218,7 +219,8 @@ class HumanModel(nn.Module):
         """Return masks ``[..., K]`` of the items a person sees without messages at a step: ``n_t``.
 
         Args:
-            implants: the discrete sites of :meth:`prior` and :meth:`round_latents`, ``[...]``.
+            implants: the sites of :meth:`prior` and :meth:`round_latents` that it may read,
+                ``[...]``, with event dimensions behind.
             observation: everything that could be seen at this step, ``[..., K, F]``.
             step: the number of the step in its round, from 0.
         """
@@ -244,7 +246,8 @@ class HumanModel(nn.Module):
         """Return what a person sees, hears, remembers and takes for granted at one step.
 
         Args:
-            implants: the discrete sites of :meth:`prior` and :meth:`round_latents`, ``[...]``.
+            implants: the sites of :meth:`prior` and :meth:`round_latents` that it may read,
+                ``[...]``, with event dimensions behind.
             knowledge: that of the step before, at first :meth:`nothing_known`.
             observation: everything that could be seen at this step, ``[..., K, F]``.
             told: what is communicated at this step, ``[..., K]``.

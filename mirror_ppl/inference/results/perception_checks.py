@@ -123,7 +123,7 @@ class PerceivedAgain:
 
     Attributes:
         human: the model of people.
-        sites: the discrete sites that perception reads.
+        sites: the sites that perception reads.
         rounds: R rounds.
         draws: draws of the implants ``[S, 1, 1, ...]``.
     """
@@ -276,7 +276,7 @@ class PerceivedAgain:
         return BeliefState.initial(human, number, self.memory)
 
     def _implants(self, draw: Tensor) -> dict[str, Tensor]:
-        """Return the discrete sites that perception reads, of these draws ``[n]``."""
+        """Return the sites that perception reads, of these draws ``[n, ...]``."""
         return {site: self.draws[site][draw, 0, 0] for site in self.sites}
 
     def _transition(self, step: int, place: Tensor, implants: Implants, first: bool) -> Transition:
