@@ -396,8 +396,10 @@ def _people(options: Options):
                 f"{options.posterior} are of the population {source['population']}"
             )
     elif f"recorded_{OWN_HUMAN_MODEL}" in posterior.attributes and options.people_model is None:
+        own = OWN_HUMAN_MODEL in posterior.attributes and options.human_model is None
+        also = ", and the model that was fitted by --human-model" if own else ""
         raise PosteriorError(
             f"{options.posterior}: is of people drawn from the {source['population']}, your own "
-            "human model; give it by --people-model path/to/file.py:Class"
+            "human model; give it by --people-model path/to/file.py:Class" + also
         )
     return posterior, source

@@ -136,5 +136,5 @@ class FitPlots:
         raise InputError(
             f"there is no picture {names[0].removesuffix('.png')} of "
             f"{self.data['posterior'].attrs.get('human_model')} in "
-            f"{self.data['posterior'].attrs.get('domain')}; implants() draws any human model"
+            f"{self.data['posterior'].attrs.get('domain')}; implants(person) draws any human model"
         )
