@@ -467,6 +467,16 @@ def test_points_do_not_count_their_own_kernels(toy):
     assert float(kernels.log_density(some, as_another)) != pytest.approx(float(found), abs=1e-3)
 
 
+@torch.no_grad()
+def test_nothing_is_left_of_a_single_kernel_at_its_point(toy):
+    points = PriorPoints.of(Vector(toy.self_model)).draw(50, 0)
+    whitening = Whitening.of(Coordinates.of(Vector(toy.self_model), points), points)
+    one, number = points.chosen(torch.tensor([3])), torch.tensor([3])
+    kernels = Kernels.around(whitening, one, number, torch.ones(1).double())
+    assert kernels.log_density(one, number).tolist() == [-math.inf]
+    assert kernels.log_density(one, number + 1).isfinite().all()
+
+
 def test_probabilities_are_tempered_as_far_as_needed():
     found = tempered(torch.tensor([0.0, -10, -20, -30]), 3.0)
     assert float(1 / found.exp().square().sum()) == pytest.approx(3, abs=1e-3)
