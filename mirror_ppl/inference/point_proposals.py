@@ -132,6 +132,7 @@ class Whitening:
     def of(cls, coordinates: Coordinates, points: Grid) -> Whitening:
         """Fit the transformation to points from the prior."""
         places = coordinates.places(points)
+        places = places[places.isfinite().all(-1)]
         centred = places - places.mean(0)
         scale = centred.square().mean(0).sqrt() + 1e-9
         correlation = (centred / scale).T @ (centred / scale) / len(places)
@@ -188,8 +189,11 @@ class Kernels:
         cls, whitening: Whitening, points: Grid, numbers: Tensor, probability: Tensor
     ) -> Kernels:
         """Fit kernels to points ``[n]`` with these numbers and probabilities."""
-        log_weights = tempered(probability.log(), min(LEARNED_FROM, len(numbers) / 2))
         white = whitening.whiten(points)
+        inside = white.isfinite().all(-1)  # not at the boundary, as an exact 0 of a share
+        white, points, numbers = white[inside], points.chosen(inside), numbers[inside]
+        probability = probability[inside] / probability[inside].sum()
+        log_weights = tempered(probability.log(), min(LEARNED_FROM, len(numbers) / 2))
         weights, leading = log_weights.exp()[:, None], whitening.leading
         mean = (weights * white).sum(0)
         centred = (white - mean)[:, :leading]
@@ -252,11 +256,13 @@ class Kernels:
         own_kernel = numbers[:, None] == self.numbers
         weights = self.log_weights.expand(own_kernel.shape).masked_fill(own_kernel, -torch.inf)
         # Of a single kernel nothing is left.
-        weights = weights.log_softmax(-1).nan_to_num(nan=-torch.inf)
+        weights = weights.log_softmax(-1)
+        weights = weights.masked_fill(weights.isnan(), -torch.inf)
         near = (found + weights).logsumexp(-1) - self.spread.log().sum()
         others = (own.square().sum(-1) - white.square().sum(-1)) / 2
         constant = white.shape[-1] * math.log(2 * math.pi) / 2
-        return near + others - constant + self.whitening.log_abs_det(values)
+        found = near + others - constant + self.whitening.log_abs_det(values)
+        return found.masked_fill(found.isnan(), -torch.inf)  # at the boundary
 
 
 @torch.no_grad()

@@ -443,6 +443,20 @@ def test_kernels_are_a_density(toy):
 
 
 @torch.no_grad()
+def test_points_at_a_boundary_are_none_of_the_kernels(toy):
+    human = Mixed(toy.self_model)
+    points = PriorPoints.of(human).draw(100, 0)
+    points["mix"][7] = torch.tensor([0.0, 0.5, 0.5])
+    whitening = Whitening.of(Coordinates.of(human, points), points)
+    assert whitening.factor.isfinite().all()
+    numbers, likely = torch.arange(100), torch.full((100,), 0.01).double()
+    kernels = Kernels.around(whitening, points, numbers, likely)
+    assert len(kernels.numbers) == 99 and kernels.spread.isfinite().all()
+    found = kernels.log_density(points, numbers)
+    assert (found == -math.inf).nonzero().flatten().tolist() == [7]
+
+
+@torch.no_grad()
 def test_points_do_not_count_their_own_kernels(toy):
     human = Far(toy.self_model)
     points = PriorPoints.of(human).draw(50, 0)
