@@ -230,7 +230,7 @@ def test_perceive_may_only_read_sites(self_model, recordings):
             implants["dreams"]
             return super().perceive(implants, knowledge, observation, told, step)
 
-    message = 'perceive\\(\\) reads "dreams", which is no site of prior.*sight_front_own'
+    message = 'perceive\\(\\) reads "dreams", which is no site that prior.*sight_front_own'
     with pytest.raises(HumanModelError, match=message):
         build_view_table(Dreamer(self_model), recordings)
 

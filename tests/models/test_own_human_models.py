@@ -238,7 +238,7 @@ def test_what_is_not_a_human_model_is_refused(tmp_path, monkeypatch, human, spec
         (
             "perceive(self, implants, knowledge, observation, told, step)",
             'return implants["dreams"]',
-            r'perceive\(\) reads "dreams", which is no site of prior\(\)',
+            r'perceive\(\) reads "dreams", which is no site that prior\(\)',
         ),
         ("act(self, implants, belief, values)", "return values", "they do not sum to 1"),
         (
