@@ -70,7 +70,8 @@ def perceived_sites(human: HumanModel) -> dict[str, Tensor]:
     """Supports ``[n]`` of the discrete sites that ``perceive`` reads, in the program's order.
 
     Raises:
-        HumanModelError: ``perceive`` reads a site whose values are not 0, 1 and so on.
+        HumanModelError: ``perceive`` reads a site whose values are not 0, 1 and so on, or only
+            discrete sites with too many combinations.
     """
     read = perceived_names(human)
     supports = {name: own for name, own in discrete_sites(human).items() if name in read}
@@ -80,27 +81,29 @@ def perceived_sites(human: HumanModel) -> dict[str, Tensor]:
                 f'perceive() reads "{name}", whose values are not 0, 1 and so on; sample a place '
                 "in a list of its values"
             )
+    number = prod(len(support) for support in supports.values())
+    if number > MAX_COMBINATIONS and not needs_points(human):
+        raise HumanModelError(
+            f"perceive() depends on {number} combinations of discrete values; at most "
+            f"{MAX_COMBINATIONS} can be summed over"
+        )
     return supports
 
 
-def needs_points(human: HumanModel) -> bool:
-    """True if there are too many joint values of the sites that perception reads to sum over all.
+def continuous_perceived(human: HumanModel) -> list[str]:
+    """Names of the continuous sites that ``perceive`` reads, in the program's order."""
+    discrete = discrete_sites(human)
+    return [name for name in perceived_names(human) if name not in discrete]
 
-    One of these is continuous, or they have more than :data:`MAX_COMBINATIONS` combinations.
-    """
-    supports = perceived_sites(human)
-    number = prod(len(support) for support in supports.values())
-    return bool(set(perceived_names(human)) - supports.keys()) or number > MAX_COMBINATIONS
+
+def needs_points(human: HumanModel) -> bool:
+    """True if ``perceive`` reads a continuous site, so that sums over values are estimated."""
+    return bool(continuous_perceived(human))
 
 
 def why_points(human: HumanModel) -> str:
     """Why a model needs points, for messages."""
-    supports = perceived_sites(human)
-    continuous = [name for name in perceived_names(human) if name not in supports]
-    if continuous:
-        return f"perceive() reads the continuous {', '.join(continuous)}"
-    number = prod(len(support) for support in supports.values())
-    return f"perceive() reads {number:,} combinations of discrete sites, too many to sum over all"
+    return f"perceive() reads the continuous {', '.join(continuous_perceived(human))}"
 
 
 _read_by: WeakKeyDictionary[HumanModel, tuple[tuple[str, ...], Sites]] = WeakKeyDictionary()

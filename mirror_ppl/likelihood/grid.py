@@ -1,7 +1,7 @@
 """Joint values of the sites that perception reads, over which engines sum.
 
 They are all combinations of the values of discrete sites, or weighted points: draws of sites that
-are continuous or have too many combinations (:mod:`mirror_ppl.likelihood.points`).
+one of which is continuous (:mod:`mirror_ppl.likelihood.points`).
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Points: weighted draws of the sites that perception reads, where these cannot all be summed over.
 
-Sites are continuous, or have too many combinations. Then sums over their values are estimated by
-importance sampling: each point counts as often as the prior makes it more probable than what it was
-drawn from. The first points are drawn from the prior; :mod:`mirror_ppl.inference.point_proposals`
-adds others where the posterior is.
+One of the sites is continuous, so sums over their values are estimated by importance sampling: each
+point counts as often as the prior makes it more probable than what it was drawn from. The first
+points are drawn from the prior; :mod:`mirror_ppl.inference.point_proposals` adds others where the
+posterior is.
 """
 
 from __future__ import annotations

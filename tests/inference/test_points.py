@@ -273,33 +273,6 @@ def test_few_of_the_first_points_suffice(beyond, toy, played):
     assert float(found.pareto_k[0]) < 0.7
 
 
-class Many(Far):
-    """Discrete sites with 160,000 combinations, of which the sum counts."""
-
-    def prior(self):
-        uniform = dist.Categorical(torch.ones(20) / 20)
-        return self.rates() | {name: pyro.sample(name, uniform) for name in "abcd"}
-
-    def place(self, implants):
-        total = sum(implants[name] for name in "abcd")
-        return CUTS[(total.clamp(70, 75) - 70).long()] - 1e-3
-
-
-def test_too_many_combinations_are_inferred(toy, played):
-    human = Many(toy.self_model)
-    found = infer(human, played, InferenceOptions("importance", 500), 0)
-    one = torch.ones(20, dtype=torch.double) / 20
-    total = one
-    for _ in range(3):
-        total = torch.nn.functional.conv1d(total[None, None], one[None, None], padding=19)[0, 0]
-    prior = torch.cat([total[:71].sum()[None], total[71:75], total[75:].sum()[None]])
-    exact = (prior * likelihoods(toy, played)[:6]).sum().log()
-    # Combinations that no point has are missed, beyond the error that is said.
-    error = float(found.evidence_error[0])
-    assert error < 0.15
-    assert abs(float(found.log_evidence[0]) - float(exact)) < 4 * error + 0.1
-
-
 @pytest.mark.parametrize("spread", [1.0, 0.1, 0.03])
 @torch.no_grad()
 def test_first_points_are_drawn_from_the_density_that_divides_them(spread, toy):

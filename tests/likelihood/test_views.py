@@ -23,8 +23,8 @@ from example_views import (
 
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.likelihood.combinations import MAX_COMBINATIONS, needs_points
-from mirror_ppl.likelihood.points import FIRST_POINTS, whole_grid
+from mirror_ppl.likelihood.combinations import MAX_COMBINATIONS
+from mirror_ppl.likelihood.points import whole_grid
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, combination_scores, restricted
 from mirror_ppl.likelihood.view_table import IMPOSSIBLE, NO_VIEW, RecordedActions
@@ -235,7 +235,7 @@ def test_perceive_may_only_read_sites(self_model, recordings):
         build_view_table(Dreamer(self_model), recordings)
 
 
-def test_too_many_combinations_are_not_enumerated(self_model):
+def test_too_many_combinations_are_refused(self_model):
     class Many(Few):
         def prior(self):
             size = MAX_COMBINATIONS // 14 + 1
@@ -246,6 +246,7 @@ def test_too_many_combinations_are_not_enumerated(self_model):
             implants["many"]
             return super().perceive(implants, knowledge, observation, told, step)
 
-    grid = whole_grid(Many(self_model))
-    assert grid.sizes is None and grid.number == FIRST_POINTS
-    assert not needs_points(Few(self_model)) and whole_grid(Few(self_model)).number == 14
+    message = rf"depends on {14 * (MAX_COMBINATIONS // 14 + 1)} combinations .* at most 100000"
+    with pytest.raises(HumanModelError, match=message):
+        whole_grid(Many(self_model))
+    assert whole_grid(Few(self_model)).number == 14
