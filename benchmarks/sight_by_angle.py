@@ -31,7 +31,7 @@ from mirror_ppl.inference.results.posterior_predictive import (
     chosen_log_probability,
     predict_rounds,
 )
-from mirror_ppl.models.implants import SIGHT, sight_sites
+from mirror_ppl.models.implants import sight_sites
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -57,8 +57,7 @@ def measured(name: str, self_model: SelfModel, one: Demonstrations) -> dict[str,
     else:
         each = torch.stack([bins[draws[site][:, 0, 0]] for site in sites], -1)
         reach = each[:, list(DIRECTION_OF)]
-    true = torch.stack([one.truth[SIGHT + site.removeprefix(SIGHT)][0] for site in sites])
-    true = true[list(DIRECTION_OF)]
+    true = torch.stack([one.truth[site][0] for site in sites])[list(DIRECTION_OF)]
     low, high = torch.quantile(reach, torch.tensor([0.05, 0.95]), 0)
     return {
         "person": one.people[0],
@@ -87,7 +86,7 @@ def table(rows: Sequence[dict[str, str]]) -> str:
             float(row["log_evidence"]) - float(found[row["person"], MODELS[0]]["log_evidence"])
             for row in own
         ]
-        error = stdev(more) / math.sqrt(len(more))
+        error = stdev(more) / math.sqrt(len(more)) if len(more) > 1 else math.nan
         gain = f"{mean(more):.1f} ± {error:.1f}" if name != MODELS[0] else ""
         wide = sum(float(row["pareto_k"]) > 0.7 for row in own)
         cells = [

@@ -33,7 +33,7 @@ def person(number):
 def shown(capsys, **changes):
     summary = {"domain": "driving", "setting": "fog", "people": [person(1), person(2)]}
     summary["contradictions"] = {"steps": 10, "contradicting": 0}
-    summary["prior_conflicts"] = {}
+    summary["prior_conflicts"] = summary["several_numbers"] = {}
     show_fit(summary | changes, "cells")
     return capsys.readouterr().out
 

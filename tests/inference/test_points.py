@@ -6,12 +6,14 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from example_far import CUTS, SHARES, TRUE, Able, Far, Glasses, Rare, Scaled, Vector
+from example_programs import DistractedPerson
+from few_reaches import robot_of_few_reaches
 from paths import DOCS, EXAMPLES
-from pyro import poutine
 from scipy import integrate, stats
-from torch.distributions import constraints
 
 import mirror_ppl
+from mirror_ppl.communication.hearing import HearingPerson
 from mirror_ppl.communication.objectives import predicted_choices
 from mirror_ppl.communication.person import Person, PlanningContext
 from mirror_ppl.communication.rounds import RoundSoFar
@@ -20,85 +22,19 @@ from mirror_ppl.evaluation.fit_report import show_fit
 from mirror_ppl.inference import point_proposals
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.online import OnlinePosterior
-from mirror_ppl.inference.point_proposals import Coordinates, Kernels, Whitening
 from mirror_ppl.inference.results.identifiability import identify
 from mirror_ppl.inference.results.posterior_predictive import predict_rounds
-from mirror_ppl.inference.weighted import tempered
 from mirror_ppl.likelihood.combinations import log_priors, needs_points, perceived_names
 from mirror_ppl.likelihood.compiled import Sequential
 from mirror_ppl.likelihood.contract import check_contract
-from mirror_ppl.likelihood.grid import Grid
 from mirror_ppl.likelihood.points import FIRST_POINTS, PriorPoints, whole_grid
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.simulation import play_rounds
+from mirror_ppl.models.spans import Span
 from mirror_ppl.models.toy import RATES, ToyHuman, toy_posterior
 from mirror_ppl.training.guide import GuideOptions, train_guide
-
-SHARES = torch.tensor([0.97, 0.02, 0.006, 0.002, 0.001, 0.0007, 0.0003], dtype=torch.double)
-"""Prior probabilities of reaches: of 8,192 points, 8 have that of the recorded person."""
-CUTS = torch.tensor(stats.norm.ppf(SHARES.cumsum(0)[:-1]))
-TRUE = {"reach": torch.tensor([[4]]), "in_sight": torch.tensor([[0.9]])}
-
-
-class Far(ToyHuman):
-    """The toy, whose reach is an interval of a continuous site."""
-
-    def rates(self):
-        with poutine.block(hide=["reach"]):
-            return {name: value for name, value in super().prior().items() if name != "reach"}
-
-    def prior(self):
-        return self.rates() | {"far": pyro.sample("far", dist.Normal(0.0, 1.0))}
-
-    def place(self, implants):
-        return implants["far"]
-
-    def perceive(self, implants, knowledge, observation, told, step):
-        reach = {"reach": torch.bucketize(self.place(implants).double(), CUTS)}
-        return super().perceive(reach, knowledge, observation, told, step)
-
-
-class Vector(Far):
-    """The reach depends on the sum of twelve numbers."""
-
-    def prior(self):
-        return self.rates() | {
-            "far": pyro.sample("far", dist.Normal(torch.zeros(12), 1.0).to_event(1))
-        }
-
-    def place(self, implants):
-        return implants["far"].sum(-1) / math.sqrt(12)
-
-
-class Glasses(Far):
-    """Without glasses a person sees nothing."""
-
-    def prior(self):
-        return super().prior() | {
-            "glasses": pyro.sample("glasses", dist.Categorical(torch.tensor([0.7, 0.3])))
-        }
-
-    def place(self, implants):
-        return torch.where(implants["glasses"] > 0, implants["far"], -9.0)
-
-
-class Scaled(Far):
-    """The spread of people is inferred, too; nothing else reads it."""
-
-    def prior(self):
-        spread = pyro.sample("spread", dist.LogNormal(-0.5, 0.5))
-        return self.rates() | {"far": pyro.sample("far", dist.Normal(0.0, spread))}
-
-
-class Able(Far):
-    """Who acts well sees far: the reach depends on a site that ``act`` reads."""
-
-    def prior(self):
-        implants = self.rates()
-        far = dist.Normal(2 * implants["in_sight"] - 1, 1.0)
-        return implants | {"far": pyro.sample("far", far)}
 
 
 @pytest.fixture(scope="module")
@@ -163,17 +99,16 @@ def test_the_posterior_and_the_evidence_are_exact(kind, toy, played, seed):
     own = {name: value[:, 0, 0] for name, value in found.draws.items()}
     reach = torch.bucketize(human.place(own).double(), CUTS)
     often = torch.bincount(reach, minlength=len(joint)) / draws
-    # Points are fewer than draws: the error of a share is that of 1 / error² independent ones.
+    # Draws are chosen from points that count as 1 / error² independent ones.
     expected = joint / joint.sum()
-    tolerance = 4 * (expected * (1 - expected)).sqrt() * error + 0.02
+    tolerance = 4 * (expected * (1 - expected) * (error**2 + 1 / draws)).sqrt() + 4 / draws
     assert ((often - expected).abs() < tolerance).all()
     assert float(found.pareto_k[0]) < 0.7
-    in_sight = own["in_sight"].mean()
-    exact = (toy_posterior(toy, played).rates["in_sight"][0] @ torch.tensor([1.0, 0]).double()) / (
-        toy_posterior(toy, played).rates["in_sight"][0].sum(-1)
-    )
     if kind is not Able:
-        assert abs(float(in_sight) - float(expected @ exact)) < 4 * error * 0.2 + 0.01
+        rates = toy_posterior(toy, played).rates["in_sight"][0]
+        mean, deviation = own["in_sight"].mean(), float(own["in_sight"].std())
+        exact = float(expected @ (rates[:, 0] / rates.sum(-1)))
+        assert abs(float(mean) - exact) < 4 * deviation * math.hypot(error, draws**-0.5)
 
 
 def test_without_new_points_the_error_is_large(toy, played, monkeypatch):
@@ -181,6 +116,42 @@ def test_without_new_points_the_error_is_large(toy, played, monkeypatch):
     monkeypatch.setattr(point_proposals, "STAGES", 0)
     found = infer(Vector(toy.self_model), played, InferenceOptions("importance", 50), 0)
     assert float(found.evidence_error[0]) > 0.2
+
+
+class Chained(DistractedPerson):
+    """Attention that is summed out exactly: read throughout the round."""
+
+    def spans(self, observation):
+        return {"away": Span(0, len(observation["ego"]), 2)}
+
+
+class ChainedBesidePoints(Chained):
+    """The same, beside two numbers that change nothing."""
+
+    spans = Chained.spans
+
+    def prior(self):
+        two = dist.Normal(torch.zeros(2), 1.0).to_event(1)
+        return super().prior() | {"far": pyro.sample("far", two)}
+
+    def sees(self, implants, observation, step):
+        near = implants["far"].sum(-1, keepdim=True) < 99
+        return {
+            name: mask & near for name, mask in super().sees(implants, observation, step).items()
+        }
+
+
+def test_attention_is_summed_out_beside_points(recordings):
+    """Its evidence is that of the model without the two numbers."""
+    few = robot_of_few_reaches()
+    rounds = recordings.select_people(["person-02"]).select_rounds([0, 1])
+    options = InferenceOptions("importance", 50)
+    plain, found = (infer(kind(few), rounds, options, 0) for kind in (Chained, ChainedBesidePoints))
+    error = math.hypot(float(plain.evidence_error[0]), float(found.evidence_error[0]))
+    assert error < 0.15
+    assert abs(float(found.log_evidence[0]) - float(plain.log_evidence[0])) < 4 * error
+    draws = {name: value[:2] for name, value in found.draws.items()}
+    assert predict_rounds(ChainedBesidePoints(few), rounds, draws).isfinite().all()
 
 
 def test_people_do_not_depend_on_each_other(toy, played):
@@ -202,7 +173,8 @@ def test_online_is_as_offline(toy, played):
     reach = torch.bucketize(online.draws(2000)["far"].flatten().double(), CUTS)
     joint = exact_joint(Far, toy, played)
     often = torch.bincount(reach, minlength=len(joint)) / len(reach)
-    assert ((often - joint / joint.sum()).abs() < 0.15).all()
+    # As good as 200 independent points: 4 standard errors of a share of a half.
+    assert ((often - joint / joint.sum()).abs() < 4 * 0.5 / math.sqrt(200)).all()
     assert online.pareto_k < 0.7
 
 
@@ -248,13 +220,19 @@ def test_the_planner_predicts_as_the_program_does(in_cells, recordings):
         past = past.then(told, one.actions[0, 0, step], following)
 
 
-class Rare(Vector):
-    """Far reaches are as rare as the instance says."""
-
-    beyond = 0.0
-
-    def place(self, implants):
-        return super().place(implants) - self.beyond + CUTS[3]
+def test_planners_infer_whom_messages_reach_beside_points(in_cells, recordings):
+    one = recordings.select_people(recordings.people[:1]).select_rounds([0])
+    person = HearingPerson(in_cells, draw_prior(in_cells, 1, 8, 2), 0.5)
+    assert set(person.percepts) >= {"ahead", "behind", "hears_visual"}
+    told = {name: torch.ones_like(mask[0, 0, 0]) for name, mask in one.told.items()}
+    observation = {name: value[0, 0] for name, value in one.observation().items()}
+    past = RoundSoFar.begin(in_cells.domain, {n: value[0] for n, value in observation.items()})
+    past = past.then(told, one.actions[0, 0, 0], {n: value[1] for n, value in observation.items()})
+    after = person.after(past)
+    for site in ("ahead", "behind"):  # learned from recordings alone
+        assert torch.equal(after.draws[site], person.draws[site])
+    assert after.log_hears.isfinite().all()
+    assert not torch.allclose(after.log_hears.softmax(-1), person.log_hears.softmax(-1))
 
 
 @pytest.mark.parametrize("beyond", [1, 2, 6, 20, 200])
@@ -269,7 +247,7 @@ def test_few_of_the_first_points_suffice(beyond, toy, played):
     exact = float((prior * likelihoods(toy, played)).sum().log())
     error = float(found.evidence_error[0])
     assert error < 0.15
-    assert abs(float(found.log_evidence[0]) - exact) < 4 * error + 0.05
+    assert abs(float(found.log_evidence[0]) - exact) < 4 * error
     assert float(found.pareto_k[0]) < 0.7
 
 
@@ -287,7 +265,7 @@ def test_first_points_are_drawn_from_the_density_that_divides_them(spread, toy):
     human = Narrow(toy.self_model)
     others = {n: v for n, v in draw_prior(human, 1, 400, 7).items() if n != "far"}
     weights = log_priors(human, whole_grid(human), others, 1)[:, 0].exp().sum(-1)  # [S]
-    assert abs(float(weights.mean()) - 1) < 4 * float(weights.std()) / 20 + 0.01
+    assert abs(float(weights.mean()) - 1) < 4 * float(weights.std()) / 20
 
 
 class Shared(Far):
@@ -373,102 +351,6 @@ def test_gradients_are_refused(engine, toy, played):
 def test_the_network_is_refused(toy):
     with pytest.raises(HumanModelError, match="which the network cannot learn"):
         train_guide(Far(toy.self_model), GuideOptions(people=10), 0)
-
-
-class Mixed(Far):
-    """Sites of several kinds and supports."""
-
-    def prior(self):
-        one = torch.ones(3)
-        return self.rates() | {
-            "far": pyro.sample("far", dist.Normal(0.0, 1.0)),
-            "share": pyro.sample("share", dist.Beta(2.0, 1.0)),
-            "mix": pyro.sample("mix", dist.Dirichlet(one)),
-            "kind": pyro.sample("kind", dist.Categorical(one / 3)),
-        }
-
-    def place(self, implants):
-        seen = implants["share"] + implants["mix"][..., 0] + implants["kind"]
-        return implants["far"] + 0.1 * seen
-
-
-@torch.no_grad()
-def test_kernels_are_a_density(toy):
-    """Importance weights average to one, and give the prior's moments."""
-    human = Mixed(toy.self_model)
-    prior = PriorPoints.of(human)
-    points = prior.draw(2000, 0)
-    whitening = Whitening.of(Coordinates.of(human, points), points)
-    likely = torch.softmax(-((points["far"].double() - 1) ** 2) * 8 - 4 * points["share"], 0)
-    kernels = Kernels.around(whitening, points, torch.arange(2000), likely)
-    number = 20_000
-    drawn = kernels.draw(number)
-    assert ((drawn["far"] - 1).abs() < 1).double().mean() > 0.8
-    others = torch.arange(2000, 2000 + number)
-    assert constraints.simplex.check(drawn["mix"]).all()
-    weights = (prior.log_density(drawn).double() - kernels.log_density(drawn, others)).exp()
-    near = ((drawn["far"] - 1).abs() < 0.5).double() * (drawn["share"] < 0.5)
-    expected = (stats.norm.cdf(1.5) - stats.norm.cdf(0.5)) * 0.25  # Beta(2, 1) below .5
-    found = weights * near
-    error = float(found.std()) / math.sqrt(number)
-    assert error < 0.1 * expected
-    assert abs(float(found.mean()) - expected) < 4 * error
-
-
-@torch.no_grad()
-def test_points_at_a_boundary_are_none_of_the_kernels(toy):
-    human = Mixed(toy.self_model)
-    points = PriorPoints.of(human).draw(100, 0)
-    points["mix"][7] = torch.tensor([0.0, 0.5, 0.5])
-    whitening = Whitening.of(Coordinates.of(human, points), points)
-    assert whitening.factor.isfinite().all()
-    numbers, likely = torch.arange(100), torch.full((100,), 0.01).double()
-    kernels = Kernels.around(whitening, points, numbers, likely)
-    assert len(kernels.numbers) == 99 and kernels.spread.isfinite().all()
-    found = kernels.log_density(points, numbers)
-    assert (found == -math.inf).nonzero().flatten().tolist() == [7]
-
-
-@torch.no_grad()
-def test_points_do_not_count_their_own_kernels(toy):
-    human = Far(toy.self_model)
-    points = PriorPoints.of(human).draw(50, 0)
-    whitening = Whitening.of(Coordinates.of(human, points), points)
-    likely = torch.softmax(-8 * points["far"].double().abs(), 0)
-    own = torch.arange(50)
-    kernels = Kernels.around(whitening, points, own, likely)
-    some = Grid({site: value[:1] for site, value in points.items()})
-    without = own[1:]
-    others = Kernels(
-        whitening,
-        points.chosen(without),
-        without,
-        kernels.log_weights[1:].log_softmax(0),
-        kernels.directions,
-        kernels.centres[1:],
-        kernels.spread,
-    )
-    as_another = torch.tensor([99])
-    found = kernels.log_density(some, own[:1])
-    assert float(found) == pytest.approx(float(others.log_density(some, as_another)), abs=1e-9)
-    assert float(kernels.log_density(some, as_another)) != pytest.approx(float(found), abs=1e-3)
-
-
-@torch.no_grad()
-def test_nothing_is_left_of_a_single_kernel_at_its_point(toy):
-    points = PriorPoints.of(Vector(toy.self_model)).draw(50, 0)
-    whitening = Whitening.of(Coordinates.of(Vector(toy.self_model), points), points)
-    one, number = points.chosen(torch.tensor([3])), torch.tensor([3])
-    kernels = Kernels.around(whitening, one, number, torch.ones(1).double())
-    assert kernels.log_density(one, number).tolist() == [-math.inf]
-    assert kernels.log_density(one, number + 1).isfinite().all()
-
-
-def test_probabilities_are_tempered_as_far_as_needed():
-    found = tempered(torch.tensor([0.0, -10, -20, -30]), 3.0)
-    assert float(1 / found.exp().square().sum()) == pytest.approx(3, abs=1e-3)
-    even = torch.full((4,), math.log(1 / 4))
-    torch.testing.assert_close(tempered(even, 2.0), even)
 
 
 def test_points_that_were_not_compiled_are_refused(toy):

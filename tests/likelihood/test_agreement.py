@@ -173,21 +173,6 @@ class PlateInRounds(PER_ITEM):
     spans = PER_ITEM.spans
 
 
-class Within(ToyHuman):
-    def prior(self):
-        implants = super().prior()
-        inner = dist.Uniform(torch.zeros_like(implants["in_sight"]), implants["in_sight"])
-        return implants | {"inner": pyro.sample("inner", inner)}
-
-
-class TwoWithin(ToyHuman):
-    def prior(self):
-        implants = super().prior()
-        limits = implants["in_sight"][..., None] * torch.tensor([1.0, 2.0])
-        inner = dist.Uniform(torch.zeros_like(limits), limits).to_event(1)
-        return implants | {"inner": pyro.sample("inner", inner)}
-
-
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
@@ -204,8 +189,6 @@ class TwoWithin(ToyHuman):
         (Assuming, 'perceive.. reads "assumes_clear", which is no site'),
         (PlateInAct, '"gaze" is in the plate "items" at dimension -3'),
         (PlateInRounds, '"said" is in the plate "questions" at dimension -3'),
-        (Within, 'what "inner" can be depends on another site'),
-        (TwoWithin, 'what "inner" can be depends on another site'),
     ],
 )
 def test_what_is_of_others_or_not_followed_is_refused(kind, message, self_model):

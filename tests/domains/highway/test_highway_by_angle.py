@@ -1,16 +1,13 @@
 """The human model with a reach in each sector: prior, sight, inference, picture."""
 
 import math
-import warnings
 
 import numpy as np
 import pytest
 import torch
-from example_rounds import first_steps
+from highway_fits import quick_fit
 
-import mirror_ppl
 from mirror_ppl.communication import Person
-from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.highway.human_variants import (
     LEVEL,
@@ -23,7 +20,7 @@ from mirror_ppl.domains.highway.human_variants import (
 )
 from mirror_ppl.domains.highway.sight import has_sight, sight_picture, sight_probability
 from mirror_ppl.domains.highway.world import DIRECTION_OF, KNOTS
-from mirror_ppl.errors import HumanModelError, UnreliableWeights
+from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.implants import sight_sites
@@ -89,19 +86,7 @@ def test_it_is_a_model_of_the_highway_only(human):
 
 @pytest.fixture(scope="module")
 def fit(human):
-    recordings = load_demonstrations(asset_path("highway_fog_diverse.nc"))
-    rounds = recordings.select_people(recordings.people[:1]).select_rounds(range(2))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnreliableWeights)
-        return mirror_ppl.infer(
-            first_steps(rounds, 8),
-            human=human,
-            engine="importance",
-            settings={"proposals": 64, "enough": 16},
-            draws=16,
-            train_rounds=1,
-            explore=0,
-        )
+    return quick_fit(human, 8)
 
 
 def test_it_is_checked_and_fitted(human, fit):

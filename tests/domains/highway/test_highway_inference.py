@@ -3,21 +3,16 @@
 The self-model is untrained, so that nothing is said of how right the results are.
 """
 
-import warnings
-
 import numpy as np
 import pytest
 import torch
-from example_rounds import first_steps
+from highway_fits import quick_fit
 
-import mirror_ppl
 from mirror_ppl.communication import Person, RoundSoFar
 from mirror_ppl.communication.objectives import ExpectedValue
 from mirror_ppl.communication.planners import PlannerOptions, planner_of
-from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains.highway import Highway
 from mirror_ppl.domains.highway.sight import KNOTS, SITES, sight_probability
-from mirror_ppl.errors import UnreliableWeights
 from mirror_ppl.models import HumanModel, SelfModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.sizes import Sizes
@@ -32,18 +27,7 @@ def human():
 
 @pytest.fixture(scope="module")
 def fit(human):
-    rounds = load_demonstrations(asset_path("highway_fog_diverse.nc")).select_people([0])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnreliableWeights)
-        return mirror_ppl.infer(
-            first_steps(rounds.select_rounds(range(2)), 12),
-            human=human,
-            engine="importance",
-            settings={"proposals": 64, "enough": 16},
-            draws=16,
-            train_rounds=1,
-            explore=0,
-        )
+    return quick_fit(human, 12)
 
 
 def test_reach_and_assumption_of_a_driver_are_inferred(fit):
