@@ -66,9 +66,9 @@ class Person:
         self.number = len(next(iter(self.draws.values()), ()))
         if self.number == 0:
             raise HumanModelError("planning needs at least one posterior draw")
-        with torch.no_grad(), self._conditioned():
-            self.implants = human.prior()
         with torch.no_grad():
+            with self._conditioned():
+                self.implants = human.prior()
             read = perceived_names(human)
         self._perceived = {name: self.draws[name][:, 0, 0] for name in read}
         self.device = next(iter(self.draws.values())).device

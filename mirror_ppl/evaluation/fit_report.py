@@ -46,7 +46,7 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
         "median [90% interval] truth, if known"
         + ("; -: of another model than the most probable one" if KIND in sites else ""),
     )
-    if several := summary.get("several_numbers"):
+    if several := summary["several_numbers"]:
         names = ", ".join(f"{name} ({prod(shape)})" for name, shape in several.items())
         print(f"Implants of several numbers are in posterior.nc alone: {names}")
     _show_predictions(summary["people"])

@@ -14,7 +14,6 @@ from mirror_ppl.inference.kinds import infer_kinds, models_by_kind
 from mirror_ppl.inference.point_proposals import with_points_near
 from mirror_ppl.inference.second_look import looks_twice, second_look
 from mirror_ppl.inference.weighted import Weighted
-from mirror_ppl.likelihood.combinations import needs_points
 from mirror_ppl.likelihood.densities import adds_to_prior
 from mirror_ppl.likelihood.tables import person_builders, rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
@@ -54,7 +53,7 @@ def infer_by_importance(
             human = builder.human
             # Independent of other people, and of how many draws they took.
             seed_everything(job.seed_of(person))
-            points = needs_points(human)
+            points = builder.grid.is_points
             again = looks_twice(human) or points
             first = coarse(job.settings) if again else job.settings
             engine, own = first_pass(builder, first)
@@ -68,8 +67,7 @@ def infer_by_importance(
             if job.rounds.measurements:
                 draws |= measured_draws(job.rounds.select_people([person]), job.draws)
             evidence = (own.log_evidence, own.evidence_error) if estimated else (nan, nan)
-            probable = None if points else own.probable
-            found.append((own.pareto_k, *evidence, engine, probable))
+            found.append((own.pareto_k, *evidence, engine, own.probable))
             drawn.append(draws)
         order = sample_sites(job.human, 1)
     job.report("infer", people, people, "people")
@@ -77,8 +75,10 @@ def infer_by_importance(
     joined = {name: torch.cat([own.pop(name) for own in drawn], 1) for name in order}
     pareto_k, evidence, error, engines, combinations = zip(*found, strict=True)
     weighed = (torch.tensor(pareto_k), torch.tensor(evidence), torch.tensor(error))
-    known = tuple(own for own in combinations if own is not None)
-    return Inferred(joined, *weighed, known, engines=engines)
+    # Numbers of points mean nothing to others.
+    return Inferred(
+        joined, *weighed, () if builder.grid.is_points else combinations, engines=engines
+    )
 
 
 def has_evidence(human: HumanModel) -> bool:

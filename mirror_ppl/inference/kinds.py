@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.inference.engine import Inferred, Job
-from mirror_ppl.likelihood.combinations import needs_points, perceived_sites
+from mirror_ppl.likelihood.combinations import perceived_sites
 from mirror_ppl.models.family import KIND, OneOfKinds
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior, sample_sites
@@ -106,8 +106,6 @@ def _combinations(
     Empty where the models' combinations are not of the same values as those of the whole program,
     or are points.
     """
-    if any(needs_points(model) for model in (human, *models.values())):
-        return ()
     first, *others = (
         [(site, len(support)) for site, support in perceived_sites(model).items()]
         for model in (human, *models.values())

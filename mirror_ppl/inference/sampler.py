@@ -7,9 +7,8 @@ With draws ``psi_s ~ q`` of a person::
 where ``m`` runs over all joint values of the sites that perception reads, and densities are those
 of the program with its observed sites, scales and factors. ``q`` is the mixture of all proposals
 (Veach and Guibas, *Optimally combining sampling techniques for Monte Carlo rendering*, 1995), so
-that weights are bounded. Pareto k
-diagnoses whether there are enough draws (Vehtari, Simpson, Gelman, Yao and Gabry, *Pareto smoothed
-importance sampling*, 2015).
+that weights are bounded. Pareto k diagnoses whether there are enough draws (Vehtari, Simpson,
+Gelman, Yao and Gabry, *Pareto smoothed importance sampling*, 2015).
 """
 
 from __future__ import annotations

@@ -56,7 +56,6 @@ class Weighted:
         of_draws = max(1 / self.effective - 1 / len(self.log_weights), 0.0)
         return (of_draws + 1 / self.points) ** 0.5
 
-    @property
     def _of_sets(self) -> Tensor:
         """Posterior probability of each set of combinations ``[G]``."""
         counts = self.log_weights > -torch.inf
@@ -65,17 +64,17 @@ class Weighted:
 
     def combination_probabilities(self) -> tuple[Tensor, Tensor]:
         """Numbers of the possible combinations ``[C]``, and their posterior probabilities."""
-        sets = self.combinations
+        sets, of_sets = self.combinations, self._of_sets()
         chance = sets.share.double().diff(prepend=sets.share.new_zeros(1).double())
         which = torch.arange(len(sets), device=chance.device).repeat_interleave(sets.sizes)
-        total = torch.zeros_like(self._of_sets).index_add(0, which, chance)
-        found = (self._of_sets / total.clamp(min=torch.finfo(total.dtype).tiny))[which] * chance
+        total = torch.zeros_like(of_sets).index_add(0, which, chance)
+        found = (of_sets / total.clamp(min=torch.finfo(total.dtype).tiny))[which] * chance
         return sets.members, found / found.sum()
 
     @property
     def probable(self) -> Tensor:
         """The combinations that together have all but `NEGLIGIBLE` of the probability, sorted."""
-        probability = self._of_sets
+        probability = self._of_sets()
         best, order = probability.sort(descending=True)
         kept = torch.zeros_like(order, dtype=torch.bool)
         kept[order] = best.cumsum(0) - best < 1 - NEGLIGIBLE

@@ -196,12 +196,9 @@ def require_unread(human: HumanModel, names: Iterable[str]) -> None:
 
 @torch.no_grad()
 def log_priors(
-    human: HumanModel,
-    grid: Mapping[str, Tensor],
-    draws: Mapping[str, Tensor],
-    people: int,
+    human: HumanModel, grid: Mapping[str, Tensor], draws: Mapping[str, Tensor], people: int
 ) -> Tensor:
-    """Log prior probability ``[S, P, M]`` of each combination, relative to that of a `Grid`.
+    """Log prior probability ``[S, P, M]`` of each combination; of points, less their log proposal.
 
     Includes factors, observed sites, scales and masks of ``prior`` that depend on these sites; the
     rest is :func:`mirror_ppl.likelihood.densities.log_correction`.
@@ -215,46 +212,11 @@ def log_priors(
     Raises:
         HumanModelError: the prior of another site depends on these.
     """
-    found = _log_priors(human, grid, draws, people, corrections=True)
-    if isinstance(grid, Grid) and grid.log_proposal is not None:
-        return found - grid.log_proposal
-    return found
-
-
-@torch.no_grad()
-def log_sampled(
-    human: HumanModel, grid: Mapping[str, Tensor], draws: Mapping[str, Tensor]
-) -> Tensor:
-    """Log density ``[S, M]`` with which ``prior`` samples values ``[M, ...]`` of some sites.
-
-    Args:
-        human: the model of people.
-        grid: the values.
-        draws: values of all other sites ``[S, 1, 1, ...]``.
-    """
-    return _log_priors(human, grid, draws, 1, corrections=False)[:, 0]
-
-
-def _log_priors(
-    human: HumanModel,
-    grid: Mapping[str, Tensor],
-    draws: Mapping[str, Tensor],
-    people: int,
-    *,
-    corrections: bool,
-) -> Tensor:
-    """Log prior ``[S, P, M]`` of values; with ``corrections`` also what else depends on them."""
-    values = {site: value[:, None, None, None] for site, value in grid.items()}
-    number = len(next(iter(draws.values()))) if draws else 1
-    nodes = prior_nodes(human, {**draws, **values}, number, people)
+    number = _number(draws)
     total = next(human.parameters()).new_zeros(1, 1, 1, 1)
-    for name, node in nodes.items():
-        if name in grid and corrections:
+    for name, node in _nodes(human, grid, draws, people).items():
+        if name in grid:
             own = _log_prior(node, grid[name])
-        elif name in grid:
-            own = node["fn"].log_prob(node["value"])
-        elif not corrections:
-            continue
         elif not is_observed(node) and len(node["fn"].batch_shape) > BATCH:
             raise HumanModelError(
                 f'the prior of "{name}" depends on a site that perceive() reads; let that site '
@@ -268,7 +230,40 @@ def _log_priors(
         check_plates(name, own, people)
         total = total + own
     size = max([len(value) for value in grid.values()], default=1)
-    return total.expand(size, number, people, 1).squeeze(-1).permute(1, 2, 0)
+    found = total.expand(size, number, people, 1).squeeze(-1).permute(1, 2, 0)
+    if isinstance(grid, Grid) and grid.log_proposal is not None:
+        return found - grid.log_proposal
+    return found
+
+
+@torch.no_grad()
+def log_sampled(
+    human: HumanModel, points: Mapping[str, Tensor], draws: Mapping[str, Tensor]
+) -> Tensor:
+    """Log density ``[S, M]`` with which ``prior`` samples values ``[M, ...]`` of some sites.
+
+    Args:
+        human: the model of people.
+        points: the values.
+        draws: values of all other sites ``[S, 1, 1, ...]``.
+    """
+    nodes = _nodes(human, points, draws, 1)
+    each = [nodes[name]["fn"].log_prob(nodes[name]["value"]) for name in points]
+    size = len(next(iter(points.values())))
+    return torch.stack([own.expand(size, _number(draws), 1, 1) for own in each]).sum(0)[..., 0, 0].T
+
+
+def _number(draws: Mapping[str, Tensor]) -> int:
+    """Number of draws ``[S, ...]``; 1 if there are none."""
+    return len(next(iter(draws.values()))) if draws else 1
+
+
+def _nodes(
+    human: HumanModel, grid: Mapping[str, Tensor], draws: Mapping[str, Tensor], people: int
+) -> dict[str, Any]:
+    """Trace nodes of ``prior`` for all values ``[M, ...]`` of some sites and draws of others."""
+    values = {site: value[:, None, None, None] for site, value in grid.items()}
+    return prior_nodes(human, {**draws, **values}, _number(draws), people)
 
 
 def _log_prior(node: Any, value: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Exact posteriors over the perceptual implants, given the policy implants.
 
-Enumerates all joint values of the sites that perception reads, each with its prior
-and likelihood, without sampling or optimization: the reference for every approximate guide.
+Enumerates all joint values of the sites that perception reads, each with its prior and likelihood,
+without sampling or optimization: the reference for every approximate guide.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Joint values of the sites that perception reads, over which engines sum.
 
-They are all combinations of the values of discrete sites, or weighted points: draws of sites that
-one of which is continuous (:mod:`mirror_ppl.likelihood.points`).
+They are all combinations of the values of discrete sites, or, if one of the sites is continuous,
+weighted points (:mod:`mirror_ppl.likelihood.points`).
 """
 
 from __future__ import annotations

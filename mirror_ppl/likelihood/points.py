@@ -31,11 +31,13 @@ from mirror_ppl.randomness import forked, seed_everything
 
 FIRST_POINTS = 8192
 """Points that are drawn from the prior."""
+SEED = 0
+"""Seed of these."""
 CONDITIONS = 512
 """Draws of other sites on which the prior of points depends."""
 
 
-def whole_grid(human: HumanModel, seed: int = 0) -> Grid:
+def whole_grid(human: HumanModel) -> Grid:
     """The joint values that engines sum over: all combinations, or points from the prior.
 
     The first points of all people are the same, so that errors of their evidences have a common
@@ -43,7 +45,6 @@ def whole_grid(human: HumanModel, seed: int = 0) -> Grid:
 
     Args:
         human: the model of people.
-        seed: of points.
 
     Raises:
         HumanModelError: perception reads a discrete site whose values are not 0, 1 and so on, or
@@ -51,7 +52,7 @@ def whole_grid(human: HumanModel, seed: int = 0) -> Grid:
     """
     if not needs_points(human):
         return grid_of(perceived_sites(human))
-    return PriorPoints.of(human).draw(FIRST_POINTS, seed)
+    return PriorPoints.of(human).draw(FIRST_POINTS, SEED)
 
 
 @dataclass(frozen=True)

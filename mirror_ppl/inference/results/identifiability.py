@@ -139,13 +139,11 @@ def identify(
         rounds: simulated rounds in each scenario; 0 for none.
 
     Returns:
-        The identifiability; ``None`` for models in which perception reads no site, a continuous
-        one or more than 100,000 combinations of values, or in which percepts affect actions other
-        than through beliefs, or with a program of their own.
+        The identifiability; ``None`` for models in which perception reads no site or a continuous
+        one, in which percepts affect actions other than through beliefs, or with a program of their
+        own.
     """
-    if has_own_program(human):
-        return None
-    if needs_points(human):
+    if has_own_program(human) or needs_points(human):
         return None
     sizes = {site: len(support) for site, support in perceived_sites(human).items()}
     if not sizes:

@@ -43,9 +43,10 @@ def predict_rounds(
     draws = checked_draws(human, draws, rounds.num_people)
     if has_own_program(human):
         return Sequential(human, rounds).predict(draws)
+    read, sizes = perceived_names(human), {}
     points = needs_points(human)
-    sizes = {site: len(support) for site, support in perceived_sites(human).items()}
-    read = perceived_names(human)
+    if not points:
+        sizes = {site: len(support) for site, support in perceived_sites(human).items()}
     parts = []
     for person in range(rounds.num_people):
         own = {name: value[:, [person]] for name, value in draws.items()}
