@@ -119,8 +119,8 @@ class SoftQ(RecurrentNetworks):
         """
         domain, people = self.domain, len(self.people)
         begin = [domain.initial(rounds, generator) for generator in generators]
-        state = map_state(lambda *parts: torch.stack(parts), *begin)
         hidden = self.start(rounds)
+        state = map_state(lambda *parts: torch.stack(parts).to(hidden.device), *begin)
         last = torch.full((people, rounds), len(domain.actions), device=hidden.device)
         knowledge = domain.nothing_known(people, rounds, device=hidden.device)
         inputs, actions = [], []
@@ -132,19 +132,19 @@ class SoftQ(RecurrentNetworks):
                 for m in domain.modalities:
                     shape = (rounds, len(m.communicated))
                     noise = torch.stack([torch.rand(shape, generator=own) for own in generators])
+                    noise = noise.to(told.device)
                     heard[m.name] = can_be[m.name] & m.items_of(noise < told[:, None, None])
             seen, heard, knowledge = look(
                 domain, self.sight, setting, knowledge, observation, heard
             )
             inputs.append(network_inputs(domain, observation, seen, heard, last))
             hidden = self.step(hidden, inputs[-1])
-            probabilities = self.act(hidden).exp()
-            last = torch.stack(
-                [
-                    torch.multinomial(own, 1, generator=generator).squeeze(-1)
-                    for own, generator in zip(probabilities, generators, strict=True)
-                ]
-            )
+            probabilities = self.act(hidden).exp().cpu()  # as generators are
+            drawn = [
+                torch.multinomial(own, 1, generator=generator).squeeze(-1)
+                for own, generator in zip(probabilities, generators, strict=True)
+            ]
+            last = torch.stack(drawn).to(hidden.device)
             actions.append(torch.where(domain.over(state), -1, last))
             state = domain.transition(state, last)
         return StepInputs.of(torch.stack(inputs, 2)), torch.stack(actions, 2)

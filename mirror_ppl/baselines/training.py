@@ -225,7 +225,9 @@ def draw_batch(
     index = torch.zeros(len(counts), size, dtype=torch.long)
     padding = torch.ones(len(counts), size, dtype=torch.bool)
     for person, (count, generator) in enumerate(zip(counts, generators, strict=True)):
-        own = torch.randperm(count, generator=generator)[:size]
+        # Nothing is drawn for few rounds, so that it makes no difference how many others have.
+        few = count <= size
+        own = torch.arange(count) if few else torch.randperm(count, generator=generator)[:size]
         index[person, : len(own)] = own
         padding[person, : len(own)] = False
     index, padding = index.to(actions.device), padding.to(actions.device)

@@ -138,6 +138,17 @@ def test_a_person_s_network_is_their_own(generator):
     assert not torch.equal(unlike.log_probabilities(other), alone.log_probabilities(other))
 
 
+@pytest.mark.parametrize("rounds", [3, 6])
+def test_a_person_s_network_does_not_depend_on_how_many_rounds_others_have(rounds, generator):
+    """Also where a batch holds all rounds of one person, but not all of another."""
+    options = replace(BRIEF, batch=4)
+    one, other = rounds_of(avoid, generator, rounds), rounds_of(alternate, generator, 8, "b")
+    both = concatenate([one, other])
+    together, alone = (fit_soft_q(part, part, options, seed=3) for part in (both, one))
+    own, expected = (part.log_probabilities(one) for part in (together, alone))
+    torch.testing.assert_close(own, expected, atol=1e-4, rtol=1e-4)
+
+
 def test_padding_and_progress(generator):
     data = ragged(generator, "a", 12)
     told = []
