@@ -120,15 +120,26 @@ the person's belief from the robot's.
 """
 
 
-def planner_of(name: str, person: Person, options: PlannerOptions, seed: int) -> Communicator:
+def planner_of(
+    name: str, person: Person, options: PlannerOptions, seed: int, *, known: bool = False
+) -> Communicator:
     """Make the planner of that name for one person.
+
+    Args:
+        name: of the planner.
+        person: the person.
+        options: settings.
+        seed: of the planner's random numbers.
+        known: whether the person's draws are their true implants, so that it is not inferred which
+            messages reach them.
 
     Raises:
         UnknownNameError: no planner has that name.
     """
     if name not in PLANNERS:
         raise UnknownNameError.of("planner", name, PLANNERS)
-    person = hearing(person, options.hears)
+    if not known:
+        person = hearing(person, options.hears)
     objective = PLANNERS[name](person, options)
     search = Automatic(options.patience, items=options.items)
     if getattr(objective, "one_step", False):

@@ -120,6 +120,11 @@ def _goes_on(world: World) -> list[str]:
     """Check transitions and rewards: pure, batched, of the same types, finite."""
     state = _start(world)
     generator = torch.Generator().manual_seed(1)
+    over = _call(world, "over", state)
+    if fault := _fault("over", "", over, (ROUNDS,), bool):
+        return [fault]
+    if bool(over.any()):
+        return ["over: true at the start of a round; rounds have at least one step"]
     for step in range(world.horizon):
         action = torch.randint(len(world.actions), (ROUNDS,), generator=generator)
         before = copy.deepcopy(state)

@@ -194,8 +194,7 @@ def _oracle(listener: Listener, options: PlannerOptions, seed: int) -> Say:
         human, truth = known
         if listener.domain.random:  # a draw for each future
             truth = {name: value.expand(FUTURES, *value.shape[1:]) for name, value in truth.items()}
-        planner = planner_of("mirror", Person(human, truth), replace(options, hears=1.0), seed)
-        return Planning(planner)
+        return Planning(planner_of("mirror", Person(human, truth), options, seed, known=True))
     own = people_of(listener.domain.name)
     if own is None:
         raise InputError(NO_ORACLE)

@@ -64,7 +64,7 @@ class Played:
             },
             {name: sum(one.communicable[name] for one in parts) for name in first.communicable},
             steps,
-            sum(one.milliseconds * one.steps for one in parts) / steps,
+            sum(one.milliseconds * one.steps for one in parts) / max(steps, 1),
             [entry | {"round": place} for place, one in enumerate(parts) for entry in one.log],
         )
 
@@ -128,7 +128,7 @@ class Tally:
             {notion: _lists(counts) for notion, counts in self.relevant.items()},
             self.communicable,
             self.steps,
-            1000 * seconds / self.steps,
+            1000 * seconds / max(self.steps, 1),
             log,
         )
 

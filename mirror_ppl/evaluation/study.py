@@ -45,8 +45,12 @@ CODE = (
     *(f"evaluation/{name}.py" for name in ("assistance", "known_sight", "learned", "learners")),
     *(f"evaluation/{name}.py" for name in ("played", "reachable_oracle", "study")),
     "cross_entropy.py",
+    "minimization.py",
+    "randomness.py",
+    "row_appending.py",
     "row_hashing.py",
     "shapes.py",
+    "training/guide_file.py",
     "data/assets/*guide*.safetensors",
 )
 """Files whose change invalidates earlier results."""

@@ -166,8 +166,7 @@ def _ahead(mirror: Paired, digits: int) -> str:
 
 def difference(ahead: Interval, digits: int) -> str:
     """Format an advantage, with its interval on the next line."""
-    low, high = (f"{value:+.{digits}f}" for value in (ahead.low, ahead.high))
-    return f"{ahead.mean:+.{digits}f}\n[{low}, {high}]"
+    return f"{ahead.mean:+.{digits}f}\n{ahead.between(f'+.{digits}f')}"
 
 
 def _ways(ways: Sequence[Way]) -> list[TextTable]:
@@ -195,8 +194,7 @@ def _way(one: Way | None) -> str:
         return ""
     text = "-"
     if one.share is not None:
-        mean, low, high = (100 * part for part in (one.share.mean, one.share.low, one.share.high))
-        text = f"{mean:.0f}% [{low:.0f}, {high:.0f}]"
+        text = f"{100 * one.share.mean:.0f}% {one.share.between('.0f', 100)}"
     return text if one.learned is None else f"{text}\n{difference(one.learned, 2)}"
 
 
@@ -206,8 +204,7 @@ def _shares(shares: Sequence[Share], title: str) -> TextTable:
     for one in shares:
         text = "no messages"
         if one.share is not None:
-            low, high = 100 * one.share.low, 100 * one.share.high
-            text = f"{100 * one.share.mean:.0f}% [{low:.0f}, {high:.0f}] of {one.items}"
+            text = f"{100 * one.share.mean:.0f}% {one.share.between('.0f', 100)} of {one.items}"
         if one.mirror is not None:
             text += f"\n{_ahead(one.mirror, 2)}"
         cells.setdefault((one.model, one.rounds), {})[one.modality] = text
@@ -226,7 +223,7 @@ def _shares(shares: Sequence[Share], title: str) -> TextTable:
 
 
 def _text(one: Interval) -> str:
-    return f"{one.mean:+.3f} [{one.low:+.3f}, {one.high:+.3f}]"
+    return f"{one.mean:+.3f} {one.between('+.3f')}"
 
 
 def _counted(number: int) -> str:

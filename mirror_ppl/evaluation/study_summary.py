@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import pandas as pd
@@ -40,11 +40,23 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean over people, with its 90% interval."""
+    """A mean over people, with its 90% interval; its ends are NaN if there is one person."""
 
     mean: float
     low: float
     high: float
+
+    @classmethod
+    def of(cls, mean: float, resampled: np.ndarray, people: int) -> Self:
+        """Take the interval from means of resampled people."""
+        low, high = np.quantile(resampled, LEVELS) if people > 1 else (np.nan, np.nan)
+        return cls(float(mean), float(low), float(high))
+
+    def between(self, form: str, scale: float = 1.0) -> str:
+        """The interval as text, scaled."""
+        if np.isnan(self.low):
+            return "(one person)"
+        return f"[{scale * self.low:{form}}, {scale * self.high:{form}}]"
 
 
 @dataclass(frozen=True)
@@ -143,9 +155,8 @@ class Share:
 
 
 def interval(values: np.ndarray) -> Interval:
-    """Mean of ``[n]`` people's values, with its bootstrap interval."""
-    low, high = np.quantile(values[_drawn(len(values))].mean(1), LEVELS)
-    return Interval(float(values.mean()), float(low), float(high))
+    """Mean of ``[n]`` people's values, with its bootstrap interval, unless there is one person."""
+    return Interval.of(values.mean(), values[_drawn(len(values))].mean(1), len(values))
 
 
 def paired(first: np.ndarray, second: np.ndarray) -> Paired:
@@ -209,9 +220,8 @@ def ways_to_oracle(rows: Rows) -> list[Way]:
             drawn = _drawn(len(who))
             ways = (oracle - none)[drawn].mean(1)
             if (ways > 0).all():
-                low, high = np.quantile((net - none)[drawn].mean(1) / ways, LEVELS)
                 mean = (net - none).mean() / (oracle - none).mean()
-                share = Interval(float(mean), float(low), float(high))
+                share = Interval.of(mean, (net - none)[drawn].mean(1) / ways, len(who))
         prior, learned = values.get((place, model, 0), {}), None
         if rounds and (both := _both(own, prior, 1)) is not None:
             learned = both.ahead
@@ -252,8 +262,7 @@ def relevance(rows: Rows, notion: str, modalities: Sequence[str]) -> list[Share]
                 drawn = _drawn(len(items))
                 totals = items[drawn].sum(1)
                 shares = good[drawn].sum(1)[totals > 0] / totals[totals > 0]
-                low, high = np.quantile(shares, LEVELS)
-                share = Interval(float(good.sum() / items.sum()), float(low), float(high))
+                share = Interval.of(good.sum() / items.sum(), shares, len(items))
             found.append(Share(place, model, rounds, name, int(items.sum()), share, ahead))
     return found
 

@@ -1,5 +1,6 @@
 """Cells of studies: the rows they give, and what their identity depends on."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,17 @@ from example_groups import FOG
 from mirror_ppl.commands import evaluate
 from mirror_ppl.evaluation import study
 from mirror_ppl.evaluation.study import Assistance, Prediction, assist, predict
+
+BESIDE_RESULTS = {
+    *("commands", "evaluation", "plots", "training"),
+    *(f"{name}.py" for name in ("__init__", "__main__", "arviz", "checkpoints", "checks")),
+    *(f"{name}.py" for name in ("console", "devices", "errors", "face", "files", "fitted")),
+    *(f"{name}.py" for name in ("jobs", "lazy", "limits", "netcdf", "option_help", "progress")),
+    *(f"{name}.py" for name in ("stepping", "timing", "user_code", "version", "workers")),
+    *(f"{name}.py" for name in ("assist", "calibrate", "check_domain", "compare", "evaluate")),
+    *(f"{name}.py" for name in ("fit", "simulate", "train")),
+}
+"""Files and folders of the package that do not change the results of a study."""
 
 
 def test_messages_are_counted_and_paid_for():
@@ -82,6 +94,13 @@ def test_results_depend_on_the_code_that_made_them():
         assert root / name in files
     for part in study.CODE:
         assert list(root.glob(part)), part
+    found = [
+        Path(module.__file__)
+        for name, module in sys.modules.items()
+        if name.partition(".")[0] == "mirror_ppl" and getattr(module, "__file__", None)
+    ]
+    others = {path.relative_to(root).parts[0] for path in {*found} - files}
+    assert others <= BESIDE_RESULTS
     assert root / "plots/study.py" not in files
     cell = Prediction(FOG, "mirror", 1)
     before = study.identities(["driving"])(cell)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mirror_ppl.evaluation.study_report import REPORTS
+from mirror_ppl.evaluation.study_report import REPORTS, difference
 from mirror_ppl.evaluation.study_summary import (
     Interval,
     Place,
@@ -32,6 +32,13 @@ def row(model, rounds, person="a", seed=0, place=FOG, **columns):
 def test_the_interval_of_equal_people_is_a_point():
     found = interval(np.full(7, 0.25))
     assert (found.mean, found.low, found.high) == (0.25, 0.25, 0.25)
+
+
+def test_one_person_has_no_interval():
+    found = interval(np.array([0.3]))
+    assert found.mean == 0.3 and np.isnan([found.low, found.high]).all()
+    assert difference(found, 2) == "+0.30\n(one person)"
+    assert difference(interval(np.array([0.3, 0.3])), 2) == "+0.30\n[+0.30, +0.30]"
 
 
 def test_the_interval_of_many_people_is_that_of_the_normal():
@@ -205,6 +212,6 @@ def test_tables_say_where_a_person_is_missing():
     assert "mean over 2 people" in nll.caption
     assert dict(nll.rows) == {
         "mirror": "0.300",
-        "bc": "0.500 (1 of 2 people)\n+0.100\n[+0.100, +0.100]\n100%",
+        "bc": "0.500 (1 of 2 people)\n+0.100\n(one person)\n100%",
     }
-    assert dict(accuracy.rows)["bc"] == "0.500 (1 of 2 people)\n+0.000\n[+0.000, +0.000]\n50%"
+    assert dict(accuracy.rows)["bc"] == "0.500 (1 of 2 people)\n+0.000\n(one person)\n50%"
