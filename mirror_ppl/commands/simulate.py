@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -155,9 +156,8 @@ def _command(options: Options) -> str:
     unsaid = {"out", "population"} if options.human_model else {"out"}
     if not options.told:
         unsaid.add("told")
-    parts = [
-        f"--{name.replace('_', '-')} {value}"
-        for name, value in values.items()
-        if name not in unsaid and value is not None
-    ]
-    return " ".join([PROGRAM, *parts])
+    words = PROGRAM.split()
+    for name, value in values.items():
+        if name not in unsaid and value is not None:
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    return shlex.join(words)

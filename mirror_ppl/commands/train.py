@@ -1,6 +1,7 @@
 """`python -m mirror_ppl.train`: train a self-model or a guide."""
 
 import math
+import shlex
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -239,8 +240,11 @@ def _command(options: Options) -> str:
         for part in fields(options)
         if part.name not in left_out
     }
-    given = {name: value for name, value in values.items() if value is not None}
-    return " ".join([PROGRAM, *(f"--{name.replace('_', '-')} {given[name]}" for name in given)])
+    words = PROGRAM.split()
+    for name, value in values.items():
+        if value is not None:
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    return shlex.join(words)
 
 
 def _show(card: dict) -> None:
