@@ -21,7 +21,7 @@ from mirror_ppl.communication.decision import (
     Decision,
     Gain,
     gain_over_silence,
-    standard_error,
+    least_gains,
 )
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.objectives import Objective, Value, Valued
@@ -181,7 +181,7 @@ def choose(valued: Valued, standard_errors: float) -> int:
 
     Returns silence, candidate 0, if no lower bound is positive; the first one among ties.
     """
-    least = _least(valued, valued.utility - valued.utility[:1], standard_errors)
+    least = least_gains(valued, valued.utility - valued.utility[:1], standard_errors)
     best = int(least.argmax())
     return best if float(least[best]) > TIE else 0
 
@@ -205,13 +205,8 @@ def slimmed(value: Value, found: Found, chosen: int, standard_errors: float) -> 
         less[torch.arange(len(places)), 0, places] = False
         found, place = joined(found, less, value)
         gain = found.valued.utility[chosen] - found.valued.utility[place]
-        least = _least(found.valued, gain, standard_errors)
+        least = least_gains(found.valued, gain, standard_errors)
         worst = int(least.argmin())
         if float(least[worst]) > TIE:
             return found, chosen
         chosen = int(place[worst])
-
-
-def _least(valued: Valued, gain: Tensor, standard_errors: float) -> Tensor:
-    """Return lower bounds ``[C]`` of mean gains ``[C, S]``: mean - ``standard_errors`` * SE."""
-    return gain.mean(-1) - standard_errors * standard_error(valued, gain)

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
+from scipy.special import stdtrit
 from torch import Tensor
 
 from mirror_ppl.communication.messages import Channels, Message
@@ -19,8 +20,8 @@ from mirror_ppl.domains.world import offers
 if TYPE_CHECKING:
     import pandas as pd
 
-INTERVAL = 1.645
-"""Half-width of a 90% interval in standard errors."""
+UPPER = 0.95
+"""Upper end of a 90% interval."""
 LITTLE = 0.01
 """Changes of a probability below this are not reported as explanations."""
 ADVICE_DISCOUNT = 0.95
@@ -39,16 +40,18 @@ class Gain:
         mean: over posterior draws.
         standard_error: of that mean.
         probability: share of the draws in which the message is better.
+        number: of independent draws, of the posterior or, in a random world, of the world.
     """
 
     mean: float
     standard_error: float
     probability: float
+    number: int = 1
 
     @property
     def interval(self) -> tuple[float, float]:
-        """90% interval of the mean."""
-        width = INTERVAL * self.standard_error
+        """90% interval of the mean, by Student's t; the mean alone if there is a single draw."""
+        width = stdtrit(self.number - 1, UPPER) * self.standard_error if self.number > 1 else 0.0
         return self.mean - width, self.mean + width
 
     def __str__(self) -> str:
@@ -158,7 +161,7 @@ class Decision:
         """
         if self.found is None:
             return {}
-        candidates, mean = self.found.candidates, self.found.valued.utility.mean(-1)
+        candidates, mean = self.found.candidates, self.found.valued.mean
         plan = candidates[self.chosen]
         result = {}
         for place, pair in enumerate(Channels(self.domain).pairs):
@@ -243,10 +246,10 @@ class Decision:
             if message:
                 return f"{self._about(message)}: can wait {step} step{'s' * (step > 1)}"
         valued = self.found.valued
-        gain = gain_over_silence(valued, int(valued.utility.mean(-1).argmax()))
+        gain = gain_over_silence(valued, int(valued.mean.argmax()))
         if gain.mean >= SHOWN:
             gains = valued.utility - valued.utility[:1]
-            least = gains.mean(-1) - self.standard_errors * standard_error(valued, gains)
+            least = least_gains(valued, gains, self.standard_errors)
             if bool((least > TIE).any()):
                 return f"no item of a message is reliably worth its cost (the best gains {gain})"
             why = ""
@@ -271,8 +274,14 @@ def standard_error(valued: Valued, gain: Tensor) -> Tensor:
     return parts.std(-1) / number**0.5 if number > 1 else torch.zeros_like(gain[..., 0])
 
 
+def least_gains(valued: Valued, gains: Tensor, standard_errors: float) -> Tensor:
+    """Return lower bounds ``[...]`` of mean gains ``[..., S]``: mean - ``standard_errors`` * SE."""
+    return valued.independent(gains).mean(-1) - standard_errors * standard_error(valued, gains)
+
+
 def gain_over_silence(valued: Valued, index: int) -> Gain:
     """Return the gain of a candidate over silence."""
     gain = valued.utility[index] - valued.utility[0]
+    parts = valued.independent(gain)
     error = float(standard_error(valued, gain))
-    return Gain(float(gain.mean()), error, float((gain > TIE).float().mean()))
+    return Gain(float(parts.mean()), error, float((gain > TIE).float().mean()), len(parts))

@@ -13,9 +13,10 @@ the next fit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 from itertools import product
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,8 +34,9 @@ class HearingPerson(Person):
     Args:
         human: the model of people.
         draws: values ``[S, 1, 1, ...]`` of all its sites, tensors or convertible to tensors.
-        hears: prior probability that messages of a modality reach them; in a model that infers it,
-            it counts as one additional draw.
+        hears: prior probability that messages of a modality reach them. In a model that infers it,
+            the share of draws in which each subset of channels reaches them is used for all draws;
+            the prior counts as one additional draw.
 
     Raises:
         HumanModelError, InputError: as for `Person`.
@@ -45,14 +47,13 @@ class HearingPerson(Person):
         names = [HEARS + modality.name for modality in human.domain.modalities]
         patterns = torch.tensor([*product((0, 1), repeat=len(names))], device=own.device)
         self.patterns = dict(zip(names, patterns.T, strict=True))
-        probabilities = []
-        for name, pattern in self.patterns.items():
-            chance, given = hears, own.draws.get(name)
-            if given is not None:
-                chance = (float(given.sum()) + hears) / (own.number + 1)
-            probabilities.append(torch.where(pattern == 1, chance, 1 - chance))
+        probabilities = torch.where(patterns == 1, hears, 1 - hears).prod(-1)
+        if all(name in own.draws for name in names):
+            given = torch.stack([own.draws[name].flatten() for name in names], -1)  # [S, C]
+            counts = (given[:, None] == patterns).all(-1).sum(0)
+            probabilities = (counts + probabilities) / (own.number + 1)
         # [S, H], by draw and pattern; from the second round on they differ between draws.
-        self.log_hears = torch.stack(probabilities).log().sum(0).expand(own.number, -1)
+        self.log_hears = probabilities.log().expand(own.number, -1)
         generator = torch.Generator().manual_seed(0)
         self.ladder = (torch.randperm(own.number, generator=generator) + 0.5) / own.number
         self.ladder = self.ladder.to(own.device)
@@ -134,5 +135,15 @@ def _open(human: HumanModel) -> HumanModel:
     if isinstance(human, HardOfHearing):
         return human
     own, kind = copy(human), type(human)
-    own.__class__ = type(kind.__name__, (HardOfHearing, kind), {"spans": kind.spans})
+    members = {"spans": kind.spans, "__reduce_ex__": _reduced}
+    own.__class__ = type(kind.__name__, (HardOfHearing, kind), members)
     return own
+
+
+def _reduced(human: HumanModel, protocol: int) -> tuple[Callable[..., HumanModel], tuple[Any]]:
+    """Pickle a model of :func:`_open` as the one that it was made from."""
+    del protocol
+    _, kind = type(human).__bases__
+    plain = object.__new__(kind)
+    plain.__dict__.update(human.__dict__)
+    return _open, (plain,)

@@ -44,6 +44,11 @@ class Valued:
     actions: Tensor | None
     worlds: int = 1
 
+    @property
+    def mean(self) -> Tensor:
+        """Expected utility of each candidate, ``[C]``; each draw of the world counts the same."""
+        return self.independent(self.utility).mean(-1)
+
     def independent(self, gain: Tensor) -> Tensor:
         """Return gains ``[..., S]`` whose spread is that of a mean: those of draws, or means by W.
 

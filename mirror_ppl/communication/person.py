@@ -292,9 +292,10 @@ class PlanningContext:
         return result
 
     def _dearer(self, places: Tensor, index: Tensor) -> Tensor:
-        """Return items ``[n]`` for which others lead to equal beliefs at less cost.
+        """Return items ``[n]`` for which others lead to equal beliefs at no more cost.
 
-        The others have to cost less even as number `COUNTED` of their modality.
+        The others have to cost no more even as number `COUNTED` of their modality. Of items that
+        replace each other, as those that cost nothing do, the first is kept.
 
         Args:
             places: flag indices of the items, ``[n]``.
@@ -304,4 +305,5 @@ class PlanningContext:
         alone, third = (channels.marginal(count).to(places.device) for count in (1, COUNTED))
         same = (index[:, None] == index).all(-1)
         dearer = alone[places][:, None] >= third[places] - 1e-6  # of rounding
-        return (same & dearer).any(1)
+        mutual = dearer & dearer.T
+        return (same & dearer & ~(mutual & torch.ones_like(mutual).triu())).any(1)

@@ -89,7 +89,7 @@ class Patient:
             candidates = torch.cat(plans)
             return Found(candidates, in_chunks(value, candidates))
         first = Exhaustive(self.items)(value, allowed, seed)
-        mean = first.valued.utility.mean(-1)
+        mean = first.valued.mean
         better = (mean > mean[0]).nonzero().squeeze(-1)
         if self.steps == 1 or not len(better):
             return first
@@ -154,7 +154,7 @@ class CrossEntropy:
 
         def mean(bits: Tensor) -> Tensor:
             distinct, which = torch.unique(bits, dim=0, return_inverse=True)
-            return in_chunks(value, sequences(distinct)).utility.mean(-1)[which]
+            return in_chunks(value, sequences(distinct)).mean[which]
 
         generator = torch.Generator(allowed.device).manual_seed(seed)
         best, _ = best_sequences(mean, (), self.steps * number, generator, self.options)

@@ -103,6 +103,11 @@ class Modality:
     groups: tuple[tuple[str, tuple[int, ...]], ...] = ()
 
     def __post_init__(self) -> None:
+        if not (math.isfinite(self.cost_coefficient) and self.cost_coefficient >= 0):
+            raise InputError(
+                f"modality {self.name!r}: cost_coefficient must be a number of at least 0, not "
+                f"{self.cost_coefficient}"
+            )
         if not len(self.features) == len(self.units) == len(self.scales):
             raise InputError(f"modality {self.name!r}: each feature needs a unit and a scale")
         if self.image is not None and math.prod(self.image) != len(self.features):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 
+from mirror_ppl.errors import InputError
 from mirror_ppl.models.implants import ASSUMES, SIGHT
 from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.reading import POSTERIOR, PRIOR, SAMPLE, TRUE, draws, of_person, truth
@@ -64,9 +65,12 @@ def plot_implants(data: az.InferenceData, person: str) -> Picture:
 
     Raises:
         UnknownNameError: no person has that id.
+        InputError: no implant is one number.
     """
     posterior = of_person(data, "posterior", person)
     names = scalar_implants(data)
+    if not names:
+        raise InputError("there is nothing to draw: no implant of this human model is one number")
     columns = min(4, len(names))
     rows = -(-len(names) // columns)
     figure = Picture(figsize=(3.1 * columns, 2.5 * rows + 0.7), layout="constrained")

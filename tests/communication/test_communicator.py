@@ -90,10 +90,20 @@ def test_a_gain_by_hand():
     assert gain.mean == pytest.approx(1.5)
     assert gain.standard_error == pytest.approx((5 / 3 / 4) ** 0.5)
     assert gain.probability == 0.75
-    assert gain.interval == pytest.approx((1.5 - 1.645 * 0.6455, 1.5 + 1.645 * 0.6455), abs=1e-3)
-    assert str(gain) == "+1.50 [+0.44, +2.56]"
+    # 2.353 is the .95 quantile of Student's t with three degrees of freedom.
+    assert gain.interval == pytest.approx((1.5 - 2.353 * 0.6455, 1.5 + 2.353 * 0.6455), abs=1e-3)
+    assert str(gain) == "+1.50 [-0.02, +3.02]"
     silence = gain_over_silence(valued([1.0, 2.0], [2.0, 2.0]), 0)
-    assert silence == Gain(0.0, 0.0, 0.0)
+    assert silence == Gain(0.0, 0.0, 0.0, 2)
+
+
+def test_each_draw_of_a_random_world_counts_the_same():
+    """Three draws of the person, in two of the world: the first of these has two of them."""
+    utility = torch.tensor([[0.0, 0.0, 0.0], [1.0, 4.0, 3.0]])
+    found = gain_over_silence(Valued(utility, None, worlds=2), 1)
+    assert found == Gain(3.0, 1.0, 1.0, 2)  # of (1 + 3) / 2 and 4
+    assert Valued(utility, None, worlds=2).mean.tolist() == [0.0, 3.0]
+    assert found.interval == pytest.approx((3 - 6.314, 3 + 6.314), abs=1e-3)
 
 
 @pytest.mark.parametrize("least", [-0.1, -3.0])
@@ -157,7 +167,7 @@ BLOCKED = (0, [3, 9, -9, -8], [-1, 1, -1, -1])
 def silent(decision):
     assert not decision.flags.any()
     assert not decision.message
-    assert decision.gain == Gain(0.0, 0.0, 0.0)
+    assert (decision.gain.mean, decision.gain.standard_error) == (0.0, 0.0)
     return decision.why() in (
         "silence: no message is worth its cost",
         "silence: there is nothing new to communicate now",

@@ -16,6 +16,8 @@ SHOWN, SAID = flags(visual=["front-left"]), flags(verbal=["front-left"])
 OTHER = flags(verbal=["rear-right"])
 AHEAD = "front car in the left lane, 3 cells ahead, closing"
 BEHIND = "rear car in the right lane, 3 cells behind, closing"
+TWO_DRAWS = 6.3138
+"""The .95 quantile of Student's t of two draws."""
 
 
 def decision(chosen, candidates, utility, actions=None):
@@ -80,9 +82,13 @@ def test_the_table_of_alternatives():
     assert table["cost"].tolist() == pytest.approx([0.03, 0, 0.03, 0.01 + 0.12])
     assert table["gain"].tolist() == pytest.approx([3.5, 0, 0, -0.5])
     error = [0.5, 0, 0, 1.5]
-    assert (table["high"] - table["gain"]).tolist() == pytest.approx([1.645 * e for e in error])
+    assert (table["high"] - table["gain"]).tolist() == pytest.approx(
+        [TWO_DRAWS * e for e in error], rel=1e-4
+    )
     assert table["standard_error"].tolist() == pytest.approx(list(error))
-    assert (table["gain"] - table["low"]).tolist() == pytest.approx([1.645 * e for e in error])
+    assert (table["gain"] - table["low"]).tolist() == pytest.approx(
+        [TWO_DRAWS * e for e in error], rel=1e-4
+    )
     assert table["probability"].tolist() == [1.0, 0.0, 0.0, 0.5]
     assert table["chosen"].tolist() == [True, False, False, False]
     assert table["p(stay)"].tolist() == pytest.approx([0.5, 0.9, 0.25, 0.8])
@@ -201,21 +207,21 @@ def test_why_silence():
     assert useless.why() == "silence: no message is worth its cost"
     unsure = decision(0, [plan(None), plan(SAID)], [[0.0, 0], [3, -1]])
     assert unsure.why() == (
-        "silence: no message is reliably worth its cost (the best gains +1.00 [-2.29, +4.29])"
+        "silence: no message is reliably worth its cost (the best gains +1.00 [-11.63, +13.63])"
     )
 
 
 def test_why_silence_says_which_rule_asks_for_it():
     """A gain of 1 with a standard error of .5."""
-    part = 0.5**0.5
-    gains = [[0.0, 0], [1 + part / 2**0.5, 1 - part / 2**0.5]]
+    part = 0.5 * 7**0.5
+    gains = [[0.0] * 8, [1 + part, 1 - part] * 4]
     one = replace(decision(0, [plan(None), plan(SAID)], gains), standard_errors=2.5)
-    text = "silence: no message is reliably worth its cost (the best gains +1.00 [+0.18, +1.82]"
+    text = "silence: no message is reliably worth its cost (the best gains +1.00 [+0.05, +1.95]"
     assert one.why() == f"{text}, fewer than 2.5 standard errors)"
     one = replace(one, standard_errors=1.5)
     assert one.why() == text.replace("message", "item of a message") + ")"
     # The one with the largest mean is uncertain, another one is not.
-    both = decision(0, [plan(None), plan(SAID), plan(SHOWN)], [*gains, [0.9, 0.8]])
+    both = decision(0, [plan(None), plan(SAID), plan(SHOWN)], [*gains, [0.9, 0.8] * 4])
     assert replace(both, standard_errors=2.5).why().startswith("silence: no item of a message")
 
 

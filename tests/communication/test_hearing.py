@@ -1,5 +1,7 @@
 """Which channels reach a person: exact posteriors, and planners that find out."""
 
+import copy
+import pickle
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -13,7 +15,14 @@ from mirror_ppl.communication.hearing import HearingPerson, hearing
 from mirror_ppl.communication.planners import PlannerOptions, planner_of
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import InputError
-from mirror_ppl.evaluation.assistance import Listener, listeners, play, play_together, speaker
+from mirror_ppl.evaluation.assistance import (
+    Listener,
+    Planning,
+    listeners,
+    play,
+    play_together,
+    speaker,
+)
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.family import HardOfHearing
 from mirror_ppl.models.implants import sight_sites
@@ -21,6 +30,7 @@ from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import simulate, simulated_people
+from mirror_ppl.people.of_human_model import PeopleOfHumanModel
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +75,37 @@ def test_channels_that_reach_a_person_are_inferred_exactly(driving):
             expected[draw, place] = done + prior
     torch.testing.assert_close(found, expected.softmax(-1), atol=1e-4, rtol=1e-3)
     assert (found[:, 3] - 0.64).abs().max() > 0.05  # it was worth inferring
+
+
+def test_shares_of_a_posterior_are_those_of_subsets_of_channels(driving):
+    """Half of the draws hear both, the others neither; the prior counts as one more draw."""
+    human = HardOfHearing(driving.self_model)
+    draws = draw_prior(human, 1, 8, 1)
+    half = torch.tensor([0, 1]).repeat(4).view(8, 1, 1)
+    person = HearingPerson(human, draws | {"hears_visual": half, "hears_verbal": half}, 0.9)
+    expected = torch.tensor([4 + 0.01, 0.09, 0.09, 4 + 0.81]) / 9
+    torch.testing.assert_close(person.log_hears.exp(), expected.expand(8, -1))
+
+
+def test_planners_can_be_pickled(driving):
+    planner = planner_of("mirror", Person(driving, nearly_blind(driving, 8)), PlannerOptions(), 3)
+    _, past = told_round()
+    expected = planner.plan(past)
+    for copied in (pickle.loads(pickle.dumps(planner)), copy.deepcopy(planner)):
+        assert copied.plan(past).gain == expected.gain
+        assert type(copied.person.human).__mro__[1] is HardOfHearing
+
+
+def test_the_oracle_knows_who_does_not_hear(driving):
+    kind = HardOfHearing(driving.self_model)
+    draws = {name: value[0] for name, value in draw_prior(kind, 1, 1, 1).items()}
+    deaf = {name: torch.zeros_like(draws[name]) for name in ("hears_visual", "hears_verbal")}
+    people = PeopleOfHumanModel(kind, draws | deaf)
+    one = listeners(people, 1, "fog", 3, 100)[0]
+    oracle = speaker("oracle", one, PlannerOptions(horizon=4), 1)
+    assert isinstance(oracle, Planning) and oracle.hears == {}
+    assert not any(bool(oracle.planner.person.draws[name].any()) for name in deaf)
+    assert play(one, oracle).cost == [0, 0, 0]
 
 
 def test_rounds_add_up(driving):
@@ -201,4 +242,7 @@ def test_it_is_found_out_in_all_worlds(world):
     found = person._after(past)
     assert found.shape == (4, 4) and bool(found.isfinite().all())
     assert not torch.allclose(found, person.log_hears, atol=1e-3)
-    assert person.in_round(past).percept_count >= 1
+    # In the round, each draw hears what was drawn for it by these probabilities.
+    drawn = person.in_round(past).draws
+    for site, own in person._drawn(found).items():
+        assert torch.equal(drawn[site], own)

@@ -43,6 +43,17 @@ def test_what_a_portion_shows_for_less_need_not_be_said():
     assert items(context(1.5).telling(speech)) == items(speech)
 
 
+def test_of_items_that_cost_nothing_one_of_each_kind_stays(monkeypatch):
+    """Each of them replaces itself, and those of equal meaning replace each other."""
+    for modality in WORLD.modalities:
+        monkeypatch.setitem(vars(modality), "cost_coefficient", 0.0)
+    everything = torch.ones(len(CHANNELS), dtype=torch.bool)
+    found = items(context(1.5).telling(everything))
+    assert found == {("visual", item) for item in TELLING}
+    speech = torch.tensor([name == "verbal" for name, _ in CHANNELS.pairs])
+    assert items(context(1.5).telling(speech)) == items(speech)
+
+
 def test_people_who_see_the_house_get_no_message():
     everything = torch.ones(len(CHANNELS), dtype=torch.bool)
     assert not context(10.0).telling(everything).any()

@@ -131,10 +131,11 @@ def test_intervals_are_of_the_mean_gain_and_silence_is_marked_in_their_place():
         for segment in lines.get_segments()  # by row
     }
     # Gains 1 and 3: standard deviation sqrt(2), standard error 1. Gains -1 and -2: half of that.
+    # 6.314 is the .95 quantile of Student's t with one degree of freedom.
     assert drawn == {
-        0: pytest.approx([2 - 1.645, 2 + 1.645]),
+        0: pytest.approx([2 - 6.314, 2 + 6.314], abs=1e-3),
         1: pytest.approx([0.5, 0.5]),
-        3: pytest.approx([-1.5 - 1.645 / 2, -1.5 + 1.645 / 2]),
+        3: pytest.approx([-1.5 - 6.314 / 2, -1.5 + 6.314 / 2], abs=1e-3),
     }
     (silence,) = squares(ax)
     assert (list(silence.get_xdata()), list(silence.get_ydata())) == ([0], [2])

@@ -101,7 +101,7 @@ class PosteriorFile:
                 raise PosteriorError(f'{self.path}: "{name}" holds no numbers')
             if is_reach(name, site["value"]):
                 distance = np.abs(value[..., None] - bins)
-                if not (distance.min(-1) < np.diff(bins).min() / 2).all():
+                if not (distance.min(-1) < np.diff(bins).min(initial=np.inf) / 2).all():
                     raise PosteriorError(f'{self.path}: "{name}" has values that are no bins')
                 value = distance.argmin(-1)
             fn = site["fn"]
