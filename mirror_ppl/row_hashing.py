@@ -66,6 +66,9 @@ def as_whole_numbers(values: Tensor) -> Tensor:
     """Convert numbers of any kind to whole ones of the same shape, equal for equal numbers."""
     if not values.is_floating_point():
         return values.long()
+    if values.dtype == torch.double:
+        wide = (values + 0.0).view(torch.int64)
+        return wide + (wide >> 32)
     bits = (values.float() + 0.0).view(torch.int32).long()  # + 0.0: -0 is 0
     # As bits, small whole numbers end in zeros, and sums of multiples of a power of two would
     # collide more often. The sum increases with the bits, so that different numbers stay different.

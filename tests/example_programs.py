@@ -87,10 +87,19 @@ class InRounds(DistractedPerson):
         return latents
 
 
+class ObservedWhileAway(DistractedPerson):
+    """A distracted person who says at each step what they see."""
+
+    def act(self, implants, belief, values):
+        pyro.factor("sees", 3 * belief[..., 0] + 0 * implants["lapse"])
+        pyro.sample("mood", dist.Normal(values.sum(-1), 2.0), obs=torch.tensor(0.3))
+        return super().act(implants, belief, values)
+
+
 ENUMERATED = [HumanModel, VARIANTS["one-radius"], LatePerson, DistractedPerson, Chart]
 """Programs that Pyro itself enumerates in the tests."""
 PROGRAMS = [
     *(VARIANTS[name] for name in ("perceptual-only", "policy-only", "no-implants")),
     *(FactorInPrior, FactorOfSight, Questionnaire, ScaledPrior, MaskedPrior, ObservedInAct),
-    *(*ENUMERATED, InRounds),
+    *(*ENUMERATED, InRounds, ObservedWhileAway),
 ]

@@ -15,6 +15,7 @@ import xarray as xr
 from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.errors import PosteriorError
 from mirror_ppl.inference.results.posterior_file import POSTERIOR, posterior_at, read_results
+from mirror_ppl.models.dependencies import ADDS_TO_ROUNDS
 from mirror_ppl.models.loading import model_name
 from mirror_ppl.models.simulation import OWN_HUMAN_MODEL
 
@@ -96,6 +97,12 @@ def read_fit(path: Path, by: str = "loo") -> FitFile:
         raise PosteriorError(
             f"{path}: each decision counts {power:g} times in it, so that no round can be left out "
             "of it by weighting; compare held-out rounds with --by heldout"
+        )
+    if by == "loo" and file.attributes.get(ADDS_TO_ROUNDS):
+        raise PosteriorError(
+            f"{path}: act or round_latents of its human model has factors, observed sites, scales "
+            "or masks, so that no round can be left out of it by weighting its actions; compare "
+            "held-out rounds with --by heldout"
         )
     if len(file.draws) < (least := LEAST_DRAWS if by == "loo" else 1):
         raise PosteriorError(f"{path}: holds {len(file.draws)} draws, expected {least} or more")

@@ -87,7 +87,7 @@ def has_evidence(human: HumanModel) -> bool:
     They do not if the program has factors, observed sites, scales or masks, nor if attention is
     sampled, which adds noise that their standard error does not include.
     """
-    added = adds_to_prior(human) or dependencies(human).adds_to_actions
+    added = adds_to_prior(human) or dependencies(human).adds_to_rounds
     return not (added or looks_twice(human))
 
 

@@ -15,6 +15,7 @@ from mirror_ppl.inference.amortized_guide import AmortizedGuide, guide_screening
 from mirror_ppl.inference.point_proposals import with_points_near
 from mirror_ppl.inference.second_look import looks_twice, second_look
 from mirror_ppl.inference.weighted import Weighted
+from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.round_views import Rounds
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of
@@ -47,8 +48,8 @@ class OnlinePosterior:
 
     Raises:
         InputError: an argument is of another type.
-        HumanModelError: perceptual implants affect actions other than through beliefs, or a
-            continuous one cannot be inferred.
+        HumanModelError: the model breaks its contract; perceptual implants affect actions other
+            than through beliefs, or a continuous one cannot be inferred.
 
     Attributes:
         person: id of the person; ``None`` before the first round.
@@ -68,6 +69,7 @@ class OnlinePosterior:
         self.network = None if network is None else require_kind(network, AmortizedGuide, "network")
         if self.network is not None:
             require_network_of(human, self.network)
+        check_contract(human)
         self.person: str | None = None
         self.seed = seed_number(seed)
         self.allow_contradictions = real_number(allow_contradictions, "allow_contradictions", 0, 1)

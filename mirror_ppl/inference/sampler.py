@@ -37,6 +37,7 @@ from mirror_ppl.likelihood.merged_moments import merged_for
 from mirror_ppl.likelihood.policies import ENOUGH, effective, within
 from mirror_ppl.likelihood.tables import restricted
 from mirror_ppl.likelihood.view_table import ViewTable
+from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites, unconstrained, values_of
 from mirror_ppl.randomness import forked
@@ -210,6 +211,10 @@ class Sampler:
         A share of :data:`DEFENSIVE_SHARE` of later draws still has a residual from the prior.
         """
         if SITE not in found.policy or not self.table.real.any():
+            return
+        # It replaces drawn residuals, on which no other drawn site may depend.
+        parents = dependencies(self.human).prior
+        if any(SITE in parents[name] for name in found.policy):
             return
         # Under draws that the recorded actions rule out, moments have no expected counts.
         possible = int((found.log_weights > -torch.inf).sum())

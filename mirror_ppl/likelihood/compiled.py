@@ -29,6 +29,7 @@ from mirror_ppl.likelihood.table_program import TableProgram
 from mirror_ppl.likelihood.tables import join_tables, person_builders, restricted, rounds_of
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
+from mirror_ppl.models.handlers import STEP
 from mirror_ppl.models.human import ACTION, HumanModel, has_own_program
 from mirror_ppl.models.measured import with_measurements
 from mirror_ppl.models.prior import Draws, draw_prior, values_of
@@ -275,18 +276,21 @@ class Sequential(Compiled):
         return total + _added(of_people, number, self.people)
 
     def predict(self, draws: Mapping[str, Tensor]) -> Tensor:
-        """Log-probabilities ``[S, P, B, T, A]`` of actions, each given the earlier ones."""
+        """Log-probabilities ``[S, P, B, T, A]`` of actions, each given all of the steps before."""
         number = len(next(iter(draws.values())))
         shape = (number, *self.rounds.shape[:2])
-        so_far, found = torch.zeros(shape, device=self.rounds.actions.device), []
+        said, found = [(None, torch.zeros(shape, device=self.rounds.actions.device))], []
         for name, node in self._run(draws).items():
+            step = node["infer"].get(STEP)
             if node["is_observed"] and name.startswith(f"{ACTION}_"):
+                before = [part for one, part in said if one is None or one != step]
+                so_far = sum(before[1:], before[0])
                 logits = node["fn"].logits
                 share = so_far - _over_latents(so_far, len(shape))
                 predicted = _over_latents(share[..., None] + logits, len(shape) + 1)
                 found.append(predicted.expand(*shape, -1))
             if _of_rounds(node):
-                so_far = so_far + log_prob(node) / power_of(node["fn"])
+                said.append((step, log_prob(node) / power_of(node["fn"])))
         return torch.stack(found, -2)
 
     @torch.no_grad()

@@ -26,6 +26,7 @@ from mirror_ppl.likelihood.site_contract import (
     check_names,
     check_sight,
     check_sites,
+    check_supports,
     refuse_parameters,
     refuse_plates,
 )
@@ -61,7 +62,10 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
     if not shipped and all(map(is_of_package, (human, human.self_model, domain))):
         return
     forget(human)
-    device = next(human.parameters()).device
+    like = next(human.parameters())
+    if like.dtype != torch.float32:
+        raise HumanModelError(f"parameters are of {like.dtype}, expected torch.float32")
+    device = like.device
     generator = torch.Generator(device).manual_seed(0)
     people, steps, actions = 2, 3, len(domain.actions)
     state, observed = domain.initial(people, generator), []
@@ -132,6 +136,7 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                 _check_act(human, _Returned(implants), belief)
         refuse_parameters(trace.trace)
         check_names(domain, [*latent_sites(trace.trace), *latents])
+        check_supports(human)
         if needs_points(human):
             PriorPoints.of(human)
         method = "spans"

@@ -14,8 +14,11 @@ from torch.distributions import Independent, biject_to
 from mirror_ppl.domains import Domain
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.densities import PLATES, check_plates, log_prob, sample_nodes
+from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import SIGHT
+from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.models.sites import latent_sites
+from mirror_ppl.randomness import forked, seed_everything
 
 AXES = (
     *("chain", "draw", "person", "round", "test_round", "step", "time", "direction", "sample"),
@@ -26,6 +29,8 @@ AXES = (
 """Names of dimensions and other variables in posterior files."""
 PREFIXES = ("told_", "truth_", "measured_")
 """Prefixes of variables of recordings, which sites must not have."""
+MANY = 512
+"""People that are drawn to see whether supports differ between them."""
 
 
 def check_names(domain: Domain, sites: Iterable[str]) -> None:
@@ -90,15 +95,44 @@ def check_sites(trace: poutine.Trace, people: int) -> None:
                 f'"{name}" has batch shape {tuple(fn.batch_shape)}, expected ({people}, 1) for '
                 f"{people} people; use .to_event() for several numbers a person"
             )
-        support = getattr(fn.support, "base_constraint", fn.support)  # of .to_event()
-        bounds = [bound for bound in vars(support).values() if torch.is_tensor(bound)]
-        batch = len(fn.event_shape)  # bounds may differ between the numbers of a person
-        of_people = [one.flatten(0, -1 - batch) for one in bounds if one.dim() > batch]
-        if any(bool((one != one[:1]).any()) for one in of_people):
-            raise HumanModelError(
-                f'what "{name}" can be depends on another site; sample it from 0 to 1, say, and '
-                "stretch it where it is read"
-            )
+
+
+@torch.no_grad()
+def check_supports(human: HumanModel) -> None:
+    """Refuse sites whose possible values depend on other sites, or are not as they are declared.
+
+    Many people are drawn, so that parents with few values differ between them.
+    """
+    with forked():
+        seed_everything(0)
+        for name, site in sample_sites(human, MANY).items():
+            fn = site["fn"]
+            support = getattr(fn.support, "base_constraint", fn.support)  # of .to_event()
+            bounds = [bound for bound in vars(support).values() if torch.is_tensor(bound)]
+            batch = len(fn.event_shape)  # bounds may differ between the numbers of a person
+            of_people = [one.flatten(0, -1 - batch) for one in bounds if one.dim() > batch]
+            if any(bool((one != one[:1]).any()) for one in of_people):
+                raise HumanModelError(
+                    f'what "{name}" can be depends on another site; sample it from 0 to 1, say, '
+                    "and stretch it where it is read"
+                )
+            if not fn.support.is_discrete:
+                _refuse_wrong_support(name, fn)
+
+
+def _refuse_wrong_support(name: str, fn: Any) -> None:
+    """Refuse a distribution without density at values that its support allows."""
+    transform = biject_to(fn.support)
+    place = torch.randn_like(transform.inv(fn.sample()))
+    try:
+        known = fn.log_prob(transform(place)).isfinite().all()
+    except ValueError:  # of torch's validation
+        known = False
+    if not known:
+        raise HumanModelError(
+            f'"{name}" has no density at some values that its support, {fn.support}, allows; '
+            "stretch or move values where they are read, in place of a transformed distribution"
+        )
 
 
 def check_sight(domain: Domain, trace: poutine.Trace) -> None:

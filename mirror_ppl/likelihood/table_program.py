@@ -11,6 +11,9 @@ from mirror_ppl.likelihood.densities import choices
 from mirror_ppl.likelihood.view_table import RecordedActions, ViewTable
 from mirror_ppl.models.human import HumanModel
 
+RECORDED = "recorded actions"
+"""Site of the actions of all rounds."""
+
 
 def log_likelihoods(human: HumanModel, implants: Mapping[str, Tensor], table: ViewTable) -> Tensor:
     """Log-likelihood ``[..., P, U]`` of the recordings under each sight of a round.
@@ -53,7 +56,7 @@ class TableProgram:
             implants = human.prior()
             scores = table.scores(log_likelihoods(human, implants, table))
             pyro.sample(
-                "actions",
+                RECORDED,
                 RecordedActions(scores, table.place_of(implants), table.recorded.shape[1:]),
                 obs=table.recorded[:, None],
             )

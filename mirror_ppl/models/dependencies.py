@@ -46,6 +46,10 @@ FROM_SHAPE_OF_OTHERS = {
 """Functions whose result takes only these from all other arguments."""
 
 
+ADDS_TO_ROUNDS = "adds_to_rounds"
+"""Attribute of posterior files for models with terms of rounds besides actions."""
+
+
 @dataclass(frozen=True)
 class Dependencies:
     """The direct dependencies in a human program.
@@ -66,6 +70,11 @@ class Dependencies:
     latent: Sites
     adds_to_actions: bool
     adds_to_latents: bool
+
+    @property
+    def adds_to_rounds(self) -> bool:
+        """True if the density of a round is not the probability of its actions alone."""
+        return self.adds_to_actions or self.adds_to_latents
 
 
 _found: WeakKeyDictionary[HumanModel, Dependencies] = WeakKeyDictionary()

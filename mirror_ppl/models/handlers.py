@@ -15,6 +15,10 @@ BELIEVING = "sees, perceive, evidence or believe"
 """The methods that compute beliefs, for messages."""
 
 
+STEP = "step"
+"""Key of the step in what a site says about inference."""
+
+
 class AtStep(Messenger):
     """Appends the number of the step to site names: ``action`` becomes ``action_3``."""
 
@@ -24,8 +28,8 @@ class AtStep(Messenger):
 
     def _pyro_sample(self, msg: Any) -> None:
         # Only once, because `pyro.do` sends a copy of a replaced site through all handlers again.
-        if not msg["infer"].get("has_step"):
-            msg["infer"] = {**msg["infer"], "has_step": True}
+        if STEP not in msg["infer"]:
+            msg["infer"] = {**msg["infer"], STEP: self.step}
             msg["name"] = f"{msg['name']}_{self.step}"
 
 

@@ -12,6 +12,7 @@ from mirror_ppl.commands import compare
 from mirror_ppl.data import asset_path
 from mirror_ppl.errors import OptionError, PosteriorError
 from mirror_ppl.evaluation.compared_files import read_fit
+from mirror_ppl.models.dependencies import ADDS_TO_ROUNDS
 
 
 @pytest.fixture
@@ -119,6 +120,13 @@ def test_a_file_without_what_is_measured(paths, tmp_path, capsys):
 def test_no_round_is_left_out_where_decisions_count_less_than_once(tmp_path, values):
     path = write(tmp_path / "x.nc", values, np.full((2, 4, 3, 4), 0.5), likelihood_power=0.25)
     with pytest.raises(PosteriorError, match=r"x\.nc: each decision counts 0\.25 times in it"):
+        read_fit(path)
+    assert len(read_fit(path, "heldout").draws) == 2
+
+
+def test_no_round_is_left_out_of_models_with_terms_besides_actions(tmp_path, values):
+    path = write(tmp_path / "x.nc", values, np.full((2, 4, 3, 4), 0.5), **{ADDS_TO_ROUNDS: 1})
+    with pytest.raises(PosteriorError, match="has factors, observed sites, scales or masks, so"):
         read_fit(path)
     assert len(read_fit(path, "heldout").draws) == 2
 

@@ -7,17 +7,20 @@ import pyro
 import pytest
 import scipy.stats
 import torch
+from example_programs import InRounds
 from few_reaches import robot_of_few_reaches
 from paths import ROOT
 
 import mirror_ppl
 from mirror_ppl.arviz import az
 from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.inference.importance import has_evidence
 from mirror_ppl.inference.results import criticism
 from mirror_ppl.inference.results.criticism import Comparison, base_rate, no_implants, verdict
 from mirror_ppl.inference.results.left_out import _without, left_out
 from mirror_ppl.inference.results.posterior_predictive import predict_rounds
 from mirror_ppl.inference.results.summary import predictive
+from mirror_ppl.models.dependencies import ADDS_TO_ROUNDS
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
@@ -130,16 +133,23 @@ def test_training_rounds_are_compared_with_how_often_each_was_chosen_in_others(r
     assert left_out(human, recordings.select_rounds([0]), uniform[:, :, :1]) is None
 
 
-def test_rounds_are_not_left_out_where_actions_alone_do_not_weigh_draws(recordings):
-    class Watched(HumanModel):
-        def act(self, implants, belief, values):
-            pyro.factor("gaze", 0.1 * implants["lapse"])
-            return super().act(implants, belief, values)
+class Watched(HumanModel):
+    def act(self, implants, belief, values):
+        pyro.factor("gaze", 0.1 * implants["lapse"])
+        return super().act(implants, belief, values)
 
+
+@pytest.mark.parametrize("kind", [Watched, InRounds])
+def test_where_actions_are_not_all_that_is_recorded(kind, recordings):
+    """No round can be left out by weighting draws, and there is no evidence of actions alone."""
     train = recordings.select_rounds(range(3))
     uniform = torch.full((5, 1, *train.actions.shape[1:], 2), math.log(0.5))
-    human = Watched(load_self_model(shipped_weights("driving"))[0])
+    human = kind(robot_of_few_reaches())
     assert left_out(human, train, uniform) is None
+    assert not has_evidence(human)
+    fit = mirror_ppl.infer(train, human=human, draws=10, train_rounds=2, explore=0)
+    assert fit.summary["people"][0]["log_evidence"] is None
+    assert fit.data["posterior"].attrs[ADDS_TO_ROUNDS] == "1"
 
 
 def test_people_without_held_out_rounds_can_be_unexplained(late, monkeypatch):

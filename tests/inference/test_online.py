@@ -11,6 +11,7 @@ from few_reaches import robot_of_few_reaches
 
 from mirror_ppl.communication import Person
 from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.online import OnlinePosterior
 from mirror_ppl.likelihood.view_table_builder import FEW_ROUNDS
@@ -40,6 +41,21 @@ def rounds():
 @pytest.fixture(scope="module")
 def few_reaches():
     return HumanModel(robot_of_few_reaches())
+
+
+class AmongOthers(ToyHuman):
+    """A density that is no sum over people."""
+
+    def prior(self):
+        found = super().prior()
+        rate = found["in_sight"]
+        pyro.factor("sum", 20 * rate.log().mean() * torch.ones_like(rate))
+        return found
+
+
+def test_models_that_break_their_contract_are_refused(human):
+    with pytest.raises(HumanModelError, match='the log density of "sum"'):
+        OnlinePosterior(AmongOthers(human.self_model))
 
 
 @pytest.fixture(params=["amortized", "importance"])

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mirror_ppl.row_hashing import distinct_rows, random_keys, uniform_of
+from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys, uniform_of
 
 
 def check(rows):
@@ -88,3 +88,9 @@ def test_uniform_numbers_belong_to_their_names():
     for first, second in ((numbers[1:], numbers[:-1]), (numbers[:, 1:], numbers[:, :-1])):
         pair = torch.stack([first.flatten(), second.flatten()])
         assert torch.corrcoef(pair)[0, 1].abs() < 0.015
+
+
+def test_numbers_of_64_bits_stay_different():
+    close = torch.tensor([1.0, 1 + 1e-9, 2.0**24, 2.0**24 + 1, 0.0, -0.0], dtype=torch.double)
+    found = as_whole_numbers(close)
+    assert len(set(found.tolist())) == 5 and found[4] == found[5]

@@ -278,3 +278,19 @@ def test_a_model_is_tried_once_a_fit(recordings, monkeypatch):
     human = ToyHuman(self_model())
     mirror_ppl.infer(recordings, human=human, draws=5, train_rounds=1, explore=0)
     assert tried == [human]
+
+
+class Named(ToyHuman):
+    """A factor whose name says what it is about."""
+
+    def prior(self):
+        found = super().prior()
+        pyro.factor("actions", -found["otherwise"])
+        return found
+
+
+@pytest.mark.parametrize("engine", ["importance", "svi"])
+def test_names_of_factors_are_free(engine, recordings):
+    settings = SVIOptions(steps=3) if engine == "svi" else None
+    options = InferenceOptions(engine, 5, settings)
+    assert infer(Named(self_model()), recordings, options, 0).draws["otherwise"].isfinite().all()

@@ -23,6 +23,7 @@ from mirror_ppl.inference.results.summary import summarize, summarize_newcomer
 from mirror_ppl.inference.workers import Workers, parts_of
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.limits import return_memory
+from mirror_ppl.models.dependencies import ADDS_TO_ROUNDS, dependencies
 from mirror_ppl.models.family import KIND, OneOfKinds
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import in_units
@@ -243,6 +244,8 @@ def _attributes(
         "version": __version__,
         "seed": seed,
     }
+    if dependencies(human).adds_to_rounds:
+        own[ADDS_TO_ROUNDS] = 1
     if not is_of_package(human):
         own[OWN_HUMAN_MODEL] = 1
         methods = [name for name in ("sees", "perceive") if is_own_method(human, name)]

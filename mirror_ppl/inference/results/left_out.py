@@ -59,12 +59,12 @@ def left_out(human: HumanModel, train: Demonstrations, log_probabilities: Tensor
 
     Returns:
         The predictions. ``None`` with fewer than :data:`LEAST_ROUNDS` rounds, and where posterior
-        draws cannot be weighted by actions: if ``act`` adds terms besides them, or if decisions
-        count less than once and attention is sampled.
+        draws cannot be weighted by actions: if ``act`` or ``round_latents`` adds terms besides
+        them, or if decisions count less than once and attention is sampled.
     """
     real = train.mask[0].any(-1)
     power = human.likelihood_power
-    cannot = dependencies(human).adds_to_actions or (power != 1 and human.has_round_latents)
+    cannot = dependencies(human).adds_to_rounds or (power != 1 and human.has_round_latents)
     if cannot or int(real.sum()) < LEAST_ROUNDS:
         return None
     chosen = chosen_log_probability(log_probabilities, train)[:, 0, real]  # [S, B, T]
