@@ -177,7 +177,7 @@ def load_recordings(
     populations = populations_of(domain)
     population = require_known(population or "paper", "population", populations, domain)
     if domain not in worlds:
-        raise InputError(f"no recordings of {domain} ship; name a file of them")
+        raise InputError(f"no recordings of {domain} ship; name a file of them (--demos)")
     return load_demonstrations(asset_path(f"{domain}_{setting}_{population}.nc"))
 
 

@@ -14,7 +14,7 @@ from mirror_ppl.domains import require_known
 from mirror_ppl.errors import InputError
 from mirror_ppl.files import json_text, write_together
 from mirror_ppl.inference.results import fitting
-from mirror_ppl.inference.results.criticism import FINE, NLLS
+from mirror_ppl.inference.results.criticism import FINE, NLLS, SUSPECT, UNEXPLAINED
 from mirror_ppl.inference.results.export import netcdf_content
 from mirror_ppl.inference.weighted import HIGH_PARETO_K
 from mirror_ppl.limits import LIMITS
@@ -45,8 +45,9 @@ class Fit(fitting.Fit):
         told = self.summary
         doubtful = doubtful_people(told)
         warning = f"; weights not to be relied on: {', '.join(doubtful)}" if doubtful else ""
-        wrong = [one["id"] for one in told["people"] if one["check"]["verdict"] not in FINE]
-        warning += f"; not explained by the model: {', '.join(wrong)}" if wrong else ""
+        for verdict in (SUSPECT, UNEXPLAINED):
+            wrong = [one["id"] for one in told["people"] if one["check"]["verdict"] == verdict]
+            warning += f"; {verdict}: {', '.join(wrong)}" if wrong else ""
         return (
             f"Fit({told['domain']}, {told['setting']}: {len(self.people)} people, "
             f"{told['guide']}, {len(next(iter(self.posterior.draws.values())))} draws{warning})"

@@ -90,12 +90,15 @@ def _show(world: World, remark: str) -> None:
     from mirror_ppl.console import console_for_tables
     from mirror_ppl.domains.capabilities import capabilities
     from mirror_ppl.domains.controls import bounds_in_words
+    from mirror_ppl.user_code import misspelt
 
     table = Table(title=f"{world.name}: nothing wrong", box=SIMPLE_HEAD, title_justify="left")
     for column in ("capability", "here", "what it gives"):
         table.add_column(column)
     for one, own in capabilities(world):
         table.add_row(one.method, "its own" if own else one.otherwise, one.gives)
+    for name, meant in misspelt(type(world)).items():
+        print(f"warning: {name} is no member of worlds; perhaps you meant {meant}")
     console_for_tables(100).print(table)
     items = ", ".join(f"{len(m.items)} {m.name}" for m in world.modalities)
     reach = ", ".join(f"{edge:g}" for edge in world.reach_bins)

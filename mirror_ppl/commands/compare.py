@@ -142,6 +142,8 @@ def _predictions(comparison: Comparison) -> Table:
     caption += " over rounds; weight: of each in the mixture that predicts best"
     if left_out:
         caption += "; doubtful: rounds whose estimate rests on few draws (Pareto k too high)"
+        if any(4 * (model.total.doubtful or 0) > rounds for model in comparison.models):
+            caption += ", here many: compare held-out rounds in their place (--by heldout)"
     columns = "log density", "difference", *(["doubtful"] if left_out else []), "weight"
     table = _empty(comparison, measured, caption, columns)
     for rank, model in enumerate(comparison.models, 1):

@@ -110,7 +110,7 @@ def _named(message: Any) -> dict[str, tuple[str, ...]]:
     expected = 'a message has lists of names by modality, as {"visual": ["front-left"]}'
     if not isinstance(message, Mapping):
         raise InputError(f"{expected}, not {shown(message)}")
-    for items in message.values():
+    for name, items in message.items():
         if isinstance(items, str) or not isinstance(items, Iterable):
-            raise InputError(f"{expected}, not {shown(message)}")
+            raise InputError(f"{expected}; {name!r} has {items!r}, which is no list")
     return {name: tuple(items) for name, items in message.items()}

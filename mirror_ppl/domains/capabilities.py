@@ -10,7 +10,6 @@ from torch import Tensor
 
 from mirror_ppl.domains.base import total_reward
 from mirror_ppl.domains.world import World, offers
-from mirror_ppl.user_code import misspelt
 
 REMARKED = 100
 """Number of rounds on which remarks rest."""
@@ -34,6 +33,7 @@ class Capability:
 CAPABILITIES = (
     Capability("visibility", "everything is seen", "settings: what unaided people see"),
     Capability("positions", "all items at distance 1", "thresholds of sight by distance"),
+    Capability("distance", "that of positions", "directions and distances of one's own"),
     Capability("levels", "numbers in units of scales", "networks that read whole numbers exactly"),
     Capability(
         "controls", "numbered actions", "continuous actions, and how precisely they are set"
@@ -75,8 +75,6 @@ def remarks_on(world: World) -> str:
     if not earned:
         return "all rounds are over where they begin"
     remark = f"random actions: rewards {min(earned):.3g} to {max(earned):.3g} a step"
-    for name, meant in misspelt(type(world)).items():
-        remark += f"; {name} is no member of worlds; perhaps you meant {meant}"
     if world.random and not chance:
         remark += "; no step depended on chance, so random may be left out"
     if not offers(world, "over"):

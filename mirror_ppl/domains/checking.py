@@ -86,6 +86,11 @@ def _of_names(world: World) -> list[str]:
             found.append(f"levels: {name} is no feature; there are {', '.join(sorted(known))}")
         elif not isinstance(levels, range) or not levels:
             found.append(f"levels: {name} has to have a range that is not empty, found {levels!r}")
+    if len(world.directions) > 1 and not offers(world, "distance"):
+        found.append(
+            f"distance: there are {len(world.directions)} directions, of which the default gives "
+            "the first to all items; define it"
+        )
     if world.mishap[0] not in world.reward_terms:
         found.append(f"mishap: expected one of reward_terms, found {world.mishap[0]!r}")
     return found

@@ -175,7 +175,14 @@ def _show_blocks(
 def _show_predictions(people: Sequence[dict[str, Any]]) -> None:
     """Print each person's scores of held-out actions and verdict of the model check."""
     scores: dict[str, list[str]] = {}
+    title, caption = "Whether the model explains each person", ""
     if any(person["test"] for person in people):
+        title = "How held-out actions are predicted, and whether the model explains each person"
+        caption = (
+            "NLL in nats an action; floor: entropy of the person's own choices; base rate: NLL of "
+            "the frequencies of their actions in training; no implants: NLL if the person were the "
+            "robot"
+        )
         for name in ("NLL", "floor", "accuracy"):
             own = [(person["test"] or {}).get(name.lower()) for person in people]
             scores[name] = [_number(value, 3) for value in own]
@@ -184,11 +191,10 @@ def _show_predictions(people: Sequence[dict[str, Any]]) -> None:
             scores[name.replace("_", " ")] = [_number(value, 3) for value in own]
     scores["model check"] = [person["check"]["verdict"] for person in people]
     _show_blocks(
-        "How held-out actions are predicted, and whether the model explains each person",
+        title,
         ["person", *(person["id"] for person in people)],
         [[name, *cells] for name, cells in scores.items()],
-        "NLL in nats an action; floor: entropy of the person's own choices; base rate: NLL of the "
-        "frequencies of their actions in training; no implants: NLL if the person were the robot",
+        caption,
         ends=None,
     )
 

@@ -55,6 +55,8 @@ class OnlinePosterior:
         person: id of the person; ``None`` before the first round.
         pareto_k: Pareto k of the importance weights at the last call of ``draws``; above 0.7 they
             are unreliable.
+        effective_draws: as how many independent draws they count; with a network at least 64 are
+            asked for, otherwise 400.
         seconds: duration of the last calls of ``add`` and of ``draws``.
     """
 
@@ -74,7 +76,7 @@ class OnlinePosterior:
         self.seed = seed_number(seed)
         self.allow_contradictions = real_number(allow_contradictions, "allow_contradictions", 0, 1)
         self._rounds: list[Rounds] = []
-        self.pareto_k = float("nan")
+        self.pareto_k = self.effective_draws = float("nan")
         self.seconds = 0.0, 0.0
         self._last: Weighted | None = None
         self._near: Weighted | None = None
@@ -137,7 +139,7 @@ class OnlinePosterior:
             builder, found = self._weighted()
             drawn = found.sample(number, builder.grid)
         self._last = found
-        self.pareto_k = found.pareto_k
+        self.pareto_k, self.effective_draws = found.pareto_k, found.effective
         self.seconds = self.seconds[0], monotonic() - began
         return {name: drawn[name] for name in self._order}
 

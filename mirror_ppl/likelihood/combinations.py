@@ -220,7 +220,8 @@ def log_priors(
         elif not is_observed(node) and len(node["fn"].batch_shape) > BATCH:
             raise HumanModelError(
                 f'the prior of "{name}" depends on a site that perceive() reads; let that site '
-                f'depend on "{name}" instead, or, if it is discrete, override model(), if only to '
+                f'depend on "{name}" instead, or, if it is known and the same for all people, '
+                "observe it by obs=; if it is discrete, you may also override model(), if only to "
                 "call super().model(rounds, world), for the engines svi and nuts"
             )
         else:  # scales and masks may depend on these sites where the density does not

@@ -153,7 +153,8 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
         file = getattr(sys.modules.get(type(human).__module__), "__file__", None)
         where = describe(error, None if file is None else Path(file))
         if isinstance(error, NotReturned):
-            where += "; prior() does not return that: start from super().prior()"
+            where += "; prior() does not return that: start from super().prior(), and return"
+            where += " what you add to it by its name"
             where += " (of covariates, use .get)" if method == "round_latents" else ""
         raise HumanModelError(f"{type(human).__name__}.{method} fails: {where}") from error
     if unused:

@@ -121,9 +121,11 @@ def check_supports(human: HumanModel) -> None:
 
 
 def _refuse_wrong_support(name: str, fn: Any) -> None:
-    """Refuse a distribution without density at values that its support allows."""
-    transform = biject_to(fn.support)
-    place = torch.randn_like(transform.inv(fn.sample()))
+    """Refuse a distribution that has a density where it draws, but not all over its support."""
+    transform, drawn = biject_to(fn.support), fn.sample()
+    if not bool(fn.log_prob(drawn).isfinite().all()):
+        return
+    place = torch.randn_like(transform.inv(drawn))
     try:
         known = fn.log_prob(transform(place)).isfinite().all()
     except ValueError:  # of torch's validation

@@ -31,9 +31,13 @@ def require_measurable(human: HumanModel, rounds: Demonstrations) -> None:
                 f'"{name}" was measured, but is no site of {type(human).__name__}.prior that is '
                 f"one number a person; those are {', '.join(numbers)}"
             )
-        possible = sites[name]["fn"].support.check(values[~values.isnan()])
-        if not bool(possible.all()):
-            raise InputError(f'"{name}" has measurements outside the support of its site')
+        support = sites[name]["fn"].support
+        for person, value in zip(rounds.people, values.flatten(), strict=True):
+            if not (value.isnan() or bool(support.check(value).all())):
+                raise InputError(
+                    f'"{name}" of {person} is {float(value):g}, which its site, with the support '
+                    f"{support}, cannot be"
+                )
 
 
 def with_measurements(human: HumanModel, rounds: Demonstrations) -> HumanModel:

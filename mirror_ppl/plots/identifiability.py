@@ -22,6 +22,8 @@ TITLED = 3.8
 """Inches that a title takes."""
 LEAST_WIDTH, CHARACTER = 4.4, 0.09
 """Inches of the left panel without ids, and of a character of an id."""
+LEAST_GAIN = 0.1
+"""Nats of the darkest colour, at least: lower gains are hardly worth a round."""
 WRAP = 22
 MOST_PEOPLE = 60
 
@@ -78,7 +80,7 @@ def plot_identifiability(data: az.InferenceData) -> Picture:
 
 
 def _scenarios(ax, information: np.ndarray, scenarios: list[str]) -> None:
-    most = max(float(information.max()), 1e-6)
+    most = max(float(information.max()), LEAST_GAIN)
     ax.imshow(information, cmap="Blues", vmin=0, vmax=most, aspect="auto")
     for row, values in enumerate(information):
         for column, value in enumerate(values):
@@ -87,5 +89,5 @@ def _scenarios(ax, information: np.ndarray, scenarios: list[str]) -> None:
     names = [textwrap.fill(name, WRAP, break_on_hyphens=False) for name in scenarios]
     ax.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=9)
     ax.set_yticks([])
-    ax.set_title("Expected information gain of one more round (nats)", fontsize=12)
+    ax.set_title("Expected information gain\nof one more round (nats)", fontsize=12)
     ax.spines[:].set_visible(False)

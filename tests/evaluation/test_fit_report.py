@@ -60,6 +60,12 @@ def test_a_newcomer_stands_below_people(capsys):
     assert "newcomer" not in shown(capsys)
 
 
+def test_scores_are_explained_if_there_are_any(capsys):
+    assert "How held-out actions are predicted, and whether" in shown(capsys)
+    found = shown(capsys, people=[person(1) | {"test": None}])
+    assert "Whether the model explains each person" in found and "NLL" not in found
+
+
 def test_unreliable_results_are_reported(capsys):
     doubtful = [person(1) | {"pareto_k": 0.8}, person(2) | {"pareto_k": 0.6}]
     assert "not to be relied on for person-01 (Pareto k above 0.7)" in shown(

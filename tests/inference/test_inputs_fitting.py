@@ -13,6 +13,7 @@ from few_reaches import robot_of_few_reaches
 from refused import refused
 
 from mirror_ppl.data import Demonstrations
+from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions
 from mirror_ppl.inference.amortized import AmortizedOptions
 from mirror_ppl.inference.automatic import AutomaticOptions
@@ -151,6 +152,13 @@ def test_wrong_options_are_refused(make, message):
 )
 def test_wrong_numbers_of_rounds_are_refused(two, train_rounds, message):
     refused(lambda: split_rounds(two, train_rounds), message)
+
+
+def test_recordings_without_rounds_give_the_prior_if_asked_to(two):
+    nothing = two.select_rounds([])
+    with pytest.raises(DemonstrationsError, match="the recordings hold no rounds, so that"):
+        split_rounds(nothing)
+    assert split_rounds(nothing, 0)[0].round_counts.tolist() == [0, 0]
 
 
 def test_rounds_that_are_split_are_recordings(two):

@@ -82,6 +82,7 @@ def test_round_by_round_is_the_same_as_all_at_once(human, asked):
     assert all(torch.equal(one[name], other[name]) for name in other)
     assert little.rounds == whole.rounds == FEW_ROUNDS
     assert -1 < little.pareto_k < 0.7 and min(little.seconds) > 0
+    assert little.effective_draws >= 64
     assert Person(human, one).number == 40
 
 

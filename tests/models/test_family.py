@@ -344,7 +344,7 @@ def test_without_rounds_what_is_known_is_the_prior(world, few_reaches):
     assert abs(fit.summary["people"][0]["log_evidence"]) < 0.05  # an average of weights
     assert fit.summary["people"][0]["check"]["verdict"] == "unchecked"
     assert "check.png" not in [name for name, _, _ in fit.plot.files()]
-    assert "not explained" not in repr(fit)
+    assert "unexplained" not in repr(fit) and "suspect" not in repr(fit)
     with pytest.raises(InputError, match="without training rounds there is nothing to check"):
         fit.plot.check()
 

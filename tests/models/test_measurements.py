@@ -116,7 +116,7 @@ def test_a_fit_holds_what_was_measured(tmp_path):
 
 WRONG = {
     "no site": ({"mood": [1.0]}, InputError, '"mood" was measured, but is no site of Answering'),
-    "support": ({"in_sight": [1.5]}, InputError, '"in_sight" has measurements outside the support'),
+    "support": ({"in_sight": [1.5]}, InputError, '"in_sight" of person-01 is 1.5, which its site'),
 }
 
 

@@ -254,7 +254,7 @@ def test_what_is_not_a_human_model_is_refused(tmp_path, monkeypatch, human, spec
         (
             "round_latents(self, implants)",
             'return {"mood": implants["mood"]}',
-            r"round_latents fails: NotReturned: 'mood' .*prior\(\) \(of covariates, use \.get\)$",
+            r"round_latents fails: NotReturned: 'mood' .*by its name \(of covariates, use \.get\)$",
         ),
         (
             "prior(self)",

@@ -91,6 +91,11 @@ def split_rounds(
     if train_rounds is None:
         train_rounds = TRAIN_ROUNDS if paper else max(1, -(-3 * rounds // 4))
     train_rounds = whole_number(train_rounds, "train_rounds")
+    if rounds == 0 and train_rounds:
+        raise DemonstrationsError(
+            "the recordings hold no rounds, so that the posterior is the prior; ask for it by 0 "
+            "training rounds"
+        )
     if not 0 <= train_rounds <= rounds:
         raise DemonstrationsError(f"cannot train on {train_rounds} of {rounds} rounds")
     paper = paper and train_rounds <= TEST_ROUNDS.start
