@@ -80,7 +80,7 @@ def plot_utilities(decision: Decision, most: int = MOST) -> Picture:
     ax.tick_params(axis="y", length=0, pad=8)
     title = f"Gains of candidate messages over silence: {len(drawn)} of {len(gains)} candidates"
     if len(drawn) < len(gains):
-        title += "\n(of all others, the two best, everything, and single items)"
+        title += "\n(chosen, two next best, everything, each item alone, then the best of the rest)"
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
     handles = [
         Patch(fc=BLUE),

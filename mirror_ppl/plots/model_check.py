@@ -31,6 +31,15 @@ LEAST_WIDTH, CHARACTER = 1.4, 0.09
 WRAP, DARK = 12, 2.3
 """Characters in a line of a name, and the depth of a colour above which letters are white."""
 MOST_PEOPLE = 60
+NAMES = {
+    "delayed": "fits the step before",
+    "switches": "action changes",
+    "reward": "reward at once",
+    "surprise": "surprise of actions",
+    "missed": "misses things",
+    "forgot": "forgets things",
+}
+"""What the columns of checks are called."""
 
 
 def plot_model_check(data: az.InferenceData) -> Picture:
@@ -106,8 +115,9 @@ def _p_values(ax, group: xr.Dataset) -> None:
             )
     shares = [place for place, name in enumerate(checks) if name.startswith(SHARE)]
     several = len(shares) > 1
-    _name_columns(ax, [name.removeprefix(SHARE) if several else name for name in checks])
-    named = [name for name in checks if name in ONE_SIDED]
+    names = [NAMES.get(name, name) for name in checks]
+    _name_columns(ax, [name.removeprefix(SHARE) if several else name for name in names])
+    named = [NAMES.get(name, name) for name in checks if name in ONE_SIDED]
     sided = f" (one-sided: {', '.join(named)})" if named else ""
     title = (
         f"Two-sided p-values{sided};\n"
