@@ -40,10 +40,12 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
     what = f"sees ({unit})"
     if any(name.startswith(NOTICES) for name in sites):
         what = "notices (probability at a step)"
+    named = any("most_probable" in one for one in sites.values())
     _show_people(
         summary,
         f"What each person {what} and how they decide: {summary['domain']}, {summary['setting']}",
         "median [90% interval] truth, if known"
+        + ("; of named values the most probable one (its probability)" if named else "")
         + ("; -: of another model than the most probable one" if KIND in sites else ""),
     )
     if several := summary["several_numbers"]:

@@ -15,8 +15,10 @@ from example_posteriors import (
     write,
     write_three,
 )
+from running import command
 
 from mirror_ppl.arviz import az
+from mirror_ppl.commands import compare
 from mirror_ppl.evaluation.compared_files import label_models, read_fit
 
 
@@ -112,7 +114,7 @@ def test_it_agrees_with_arviz(tmp_path, rng):
         assert model.good_k == pytest.approx(1 - 1 / np.log10(400))
 
 
-def test_rounds_that_depend_on_few_draws_are_doubtful(tmp_path):
+def test_rounds_that_depend_on_few_draws_are_doubtful(tmp_path, capsys):
     # Draws at the quantiles of what is told, so that nothing depends on chance.
     level = (np.arange(200) + 0.5) / 200
     tail = np.log(level)  # weights of exponent k have a Pareto tail of shape k
@@ -126,6 +128,8 @@ def test_rounds_that_depend_on_few_draws_are_doubtful(tmp_path):
     assert (other.label, other.total.doubtful) == ("bad", 3)
     doubtful = [None if score is None else score.doubtful for score in other.people]
     assert doubtful == [1, 0, None, 2]
+    assert command(compare, good, tmp_path / "bad.nc") == 0
+    assert "here many: compare held-out rounds" in " ".join(capsys.readouterr().out.split())
     assert one.good_k == pytest.approx(1 - 1 / np.log10(200))
 
 
