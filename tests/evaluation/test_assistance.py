@@ -307,7 +307,7 @@ def decision(chosen):
     utility = torch.tensor([[0.0, 0.0], [1.0, 0.5], [2.0, 1.0]])
     actions = torch.tensor([[[0.9, 0.1]], [[0.4, 0.6]], [[0.2, 0.8]]])
     flags = candidates[chosen, 0]
-    gain = Gain(0.0, 0.0, 0.0) if chosen == 0 else Gain(1.5, 0.5, 1.0)
+    gain = Gain(0.0, 0.0, 0.0) if chosen == 0 else Gain(1.5, 0.5, 1.0, 8)
     found = Found(candidates, Valued(utility, actions))
     message = CHANNELS.message(flags)
     return Decision(message, flags, gain, DOMAIN, DOMAIN.observe(state), found, chosen, DOMAIN)
@@ -317,7 +317,9 @@ def test_an_audit_is_the_decision_as_plain_data():
     told = audit(decision(2), most=2)
     assert json.loads(json.dumps(told, allow_nan=False)) == told
     assert told["gain"] == 1.5
-    assert told["gain_interval"] == pytest.approx([1.5 - 1.645 * 0.5, 1.5 + 1.645 * 0.5])
+    assert told["gain_interval"] == pytest.approx(
+        [1.5 - 1.8946 * 0.5, 1.5 + 1.8946 * 0.5], abs=1e-4
+    )
     assert told["matters"] == [["verbal", "front-left", 1.5]]
     turn = told["turning_point"]
     assert (turn["steps_ahead"], turn["action"]) == (0, "stay")
