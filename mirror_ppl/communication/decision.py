@@ -51,7 +51,9 @@ class Gain:
     @property
     def interval(self) -> tuple[float, float]:
         """90% interval of the mean, by Student's t; the mean alone if there is a single draw."""
-        width = stdtrit(self.number - 1, UPPER) * self.standard_error if self.number > 1 else 0.0
+        if self.number == 1:
+            return self.mean, self.mean
+        width = float(stdtrit(self.number - 1, UPPER)) * self.standard_error
         return self.mean - width, self.mean + width
 
     def __str__(self) -> str:

@@ -279,18 +279,22 @@ class Sequential(Compiled):
         """Log-probabilities ``[S, P, B, T, A]`` of actions, each given all of the steps before."""
         number = len(next(iter(draws.values())))
         shape = (number, *self.rounds.shape[:2])
-        said, found = [(None, torch.zeros(shape, device=self.rounds.actions.device))], []
+        so_far, found = torch.zeros(shape, device=self.rounds.actions.device), []
+        present, at = [], None  # what is observed at the present step
         for name, node in self._run(draws).items():
-            step = node["infer"].get(STEP)
+            if (step := node["infer"].get(STEP)) != at:
+                so_far, present, at = sum(present, so_far), [], step
             if node["is_observed"] and name.startswith(f"{ACTION}_"):
-                before = [part for one, part in said if one is None or one != step]
-                so_far = sum(before[1:], before[0])
                 logits = node["fn"].logits
                 share = so_far - _over_latents(so_far, len(shape))
                 predicted = _over_latents(share[..., None] + logits, len(shape) + 1)
                 found.append(predicted.expand(*shape, -1))
             if _of_rounds(node):
-                said.append((step, log_prob(node) / power_of(node["fn"])))
+                said = log_prob(node) / power_of(node["fn"])
+                if step is not None and node["is_observed"]:
+                    present.append(said)
+                else:
+                    so_far = so_far + said
         return torch.stack(found, -2)
 
     @torch.no_grad()

@@ -125,7 +125,9 @@ def _refuse_wrong_support(name: str, fn: Any) -> None:
     transform, drawn = biject_to(fn.support), fn.sample()
     if not bool(fn.log_prob(drawn).isfinite().all()):
         return
-    place = torch.randn_like(transform.inv(drawn))
+    place = transform.inv(drawn)
+    # Around draws, as far away densities may be rounded to 0.
+    place = place.mean(0) + 2 * place.std(0) * torch.randn_like(place)
     try:
         known = fn.log_prob(transform(place)).isfinite().all()
     except ValueError:  # of torch's validation

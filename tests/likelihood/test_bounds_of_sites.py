@@ -71,6 +71,20 @@ class Positive(ToyHuman):
         return torch.log_softmax(found + torch.stack([inner, -inner], -1), -1)
 
 
+class Narrow(ToyHuman):
+    """Far from these draws, densities are rounded to 0."""
+
+    def prior(self):
+        narrow = pyro.sample("narrow", dist.Gumbel(torch.tensor(3.0), torch.tensor(0.03)))
+        steep = pyro.sample("steep", dist.Weibull(torch.tensor(0.5), torch.tensor(25.0)))
+        return super().prior() | {"narrow": narrow, "steep": steep}
+
+    def act(self, implants, belief, values):
+        found = super().act(implants, belief, values)
+        both = implants["narrow"] + implants["steep"]
+        return torch.log_softmax(found + torch.stack([both, -both], -1), -1)
+
+
 class Fixed(ToyHuman):
     def prior(self):
         inner = dist.Uniform(torch.zeros(2), torch.tensor([1.0, 2.0])).to_event(1)
@@ -93,7 +107,7 @@ def test_supports_that_allow_too_much_are_refused(self_model):
         check_contract(Moved(self_model))
 
 
-@pytest.mark.parametrize("kind", [Fixed, Positive])
+@pytest.mark.parametrize("kind", [Fixed, Positive, Narrow])
 def test_bounds_of_the_numbers_of_a_vector_may_differ(kind, self_model):
     check_contract(kind(self_model))
 

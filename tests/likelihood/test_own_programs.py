@@ -280,6 +280,25 @@ def test_a_model_is_tried_once_a_fit(recordings, monkeypatch):
     assert tried == [human]
 
 
+class Slips(ToyHuman):
+    """Whether a person slips is drawn anew at each step."""
+
+    def choose(self, implants, belief, values, action=None):
+        slips = pyro.sample("slips", dist.Bernoulli(torch.tensor(0.3)))
+        chosen = self.act(implants, belief, values)
+        chosen = torch.where(slips[..., None] > 0, torch.full_like(chosen, -math.log(2)), chosen)
+        return pyro.sample("action", dist.Categorical(logits=chosen), obs=action)
+
+
+def test_latents_of_a_step_count_in_its_prediction(recordings):
+    human = Slips(self_model())
+    draws = draw_prior(human, 1, 3, 3)
+    found = Sequential(human, recordings).predict(draws).exp()
+    torch.testing.assert_close(found.sum(-1), torch.ones(found.shape[:-1]), rtol=0, atol=1e-5)
+    plain = Sequential(ToyHuman(self_model()), recordings).predict(draws).exp()
+    torch.testing.assert_close(found, 0.3 / 2 + 0.7 * plain, rtol=0, atol=1e-5)
+
+
 class Named(ToyHuman):
     """A factor whose name says what it is about."""
 
