@@ -5,11 +5,12 @@ import errno
 import io
 import os
 import re
+import shlex
 import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from mirror_ppl.errors import HumanModelError, MirrorError, MirrorWarning, OptionError
 from mirror_ppl.user_code import describe, passed_user_code
@@ -247,6 +248,15 @@ def _use_threads(threads: int) -> None:
         import torch
 
         torch.set_num_threads(threads)
+
+
+def command_line(program: str, options: Mapping[str, Any]) -> str:
+    """The command with these options, without those that are None, quoted for a shell."""
+    words = program.split()
+    for name, value in options.items():
+        if value is not None:
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    return shlex.join(words)
 
 
 def console_for_tables(width: int) -> "Console":

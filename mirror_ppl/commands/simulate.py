@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mirror_ppl.console import command_line
 from mirror_ppl.devices import usable_device
 from mirror_ppl.errors import OptionError
 from mirror_ppl.limits import check_numbers, require_memory
@@ -156,8 +156,4 @@ def _command(options: Options) -> str:
     unsaid = {"out", "population"} if options.human_model else {"out"}
     if not options.told:
         unsaid.add("told")
-    words = PROGRAM.split()
-    for name, value in values.items():
-        if name not in unsaid and value is not None:
-            words += [f"--{name.replace('_', '-')}", str(value)]
-    return shlex.join(words)
+    return command_line(PROGRAM, {name: values[name] for name in values if name not in unsaid})

@@ -1,11 +1,11 @@
 """`python -m mirror_ppl.train`: train a self-model or a guide."""
 
 import math
-import shlex
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from mirror_ppl.console import command_line
 from mirror_ppl.devices import usable_device
 from mirror_ppl.errors import OptionError
 from mirror_ppl.limits import check_numbers
@@ -240,11 +240,7 @@ def _command(options: Options) -> str:
         for part in fields(options)
         if part.name not in left_out
     }
-    words = PROGRAM.split()
-    for name, value in values.items():
-        if value is not None:
-            words += [f"--{name.replace('_', '-')}", str(value)]
-    return shlex.join(words)
+    return command_line(PROGRAM, values)
 
 
 def _show(card: dict) -> None:

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
-from scipy.special import stdtrit
 from torch import Tensor
 
 from mirror_ppl.communication.messages import Channels, Message
@@ -53,6 +52,8 @@ class Gain:
         """90% interval of the mean, by Student's t; the mean alone if there is a single draw."""
         if self.number == 1:
             return self.mean, self.mean
+        from scipy.special import stdtrit
+
         width = float(stdtrit(self.number - 1, UPPER)) * self.standard_error
         return self.mean - width, self.mean + width
 

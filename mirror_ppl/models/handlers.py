@@ -15,7 +15,7 @@ BELIEVING = "sees, perceive, evidence or believe"
 """The methods that compute beliefs, for messages."""
 
 
-STEP = "step"
+STEP = "at_step"
 """Key of the step in what a site says about inference."""
 
 

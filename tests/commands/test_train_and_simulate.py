@@ -3,12 +3,14 @@
 import functools
 import inspect
 import re
+import shlex
 
 import pytest
 from example_fits import RADIUS, RESULTS_OF_RADIUS, content
 from running import command
 
 from mirror_ppl.commands import fit, simulate, train
+from mirror_ppl.console import command_line
 from mirror_ppl.data import load_demonstrations
 from mirror_ppl.evaluation import self_model as evaluation
 from mirror_ppl.models.weights import load_self_model
@@ -61,3 +63,10 @@ def test_a_card_shows_a_dash_for_what_could_not_be_measured(capsys):
     train._show({"command": "train", "quality": quality})
     shown = capsys.readouterr().out
     assert shown.count(" - ") == 2 and "0.500" in shown
+
+
+def test_recorded_commands_are_quoted():
+    found = command_line(
+        "python -m mirror_ppl.fit", {"human_model": "my models/a.py:A", "seed": None}
+    )
+    assert shlex.split(found)[-2:] == ["--human-model", "my models/a.py:A"] and "seed" not in found

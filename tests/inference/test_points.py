@@ -126,7 +126,7 @@ class Chained(DistractedPerson):
 
 
 class ChainedBesidePoints(Chained):
-    """The same, beside two numbers that change nothing."""
+    """A distracted person with two numbers that change nothing."""
 
     spans = Chained.spans
 
