@@ -28,6 +28,8 @@ EVERYTHING = "anything"
 """Definition of relevance of worlds without one: all items are relevant."""
 PIXELS = 24
 """Width and height of a number in the default picture."""
+TINT = (1.0, 0.85, 0.6)
+"""Factors on red, green and blue of items that a person does not see, in the default picture."""
 
 
 class World(ABC):
@@ -358,9 +360,16 @@ class World(ABC):
         return np.kron(grey, np.ones((PIXELS, PIXELS), np.uint8))[..., None].repeat(3, -1)
 
     def render_seen(self, state: Any, visible: Visibility) -> np.ndarray:
-        """Draw a state as a person perceives it who sees items ``[K]``; by default as `render`."""
-        del visible
-        return self.render(state)
+        """Draw a state as a person perceives it who sees items ``[K]``.
+
+        The default is `render`; of worlds without their own `render`, unseen items are tinted.
+        """
+        picture = self.render(state)
+        if offers(self, "render"):
+            return picture
+        unseen = ~visible[VISUAL].numpy().repeat(PIXELS)
+        picture[unseen] = (picture[unseen] * TINT).astype(np.uint8)
+        return picture
 
     def _all(self, observation: Observation, which: Callable[[Modality], bool]) -> Visibility:
         """Return masks ``[..., K]``, constant in each modality."""

@@ -11,6 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from mirror_ppl.domains.base import Domain, Visibility
+from mirror_ppl.domains.derived import VISUAL
+from mirror_ppl.domains.world import offers
 from mirror_ppl.errors import InputError
 from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import BLUE, GREY
@@ -19,6 +21,8 @@ FRAMES = 6
 """Default number of frames."""
 LINE = 0.14
 """Inches of a line of text below a frame."""
+CHARACTERS = 14
+"""Characters of the legend on an inch of a picture's width."""
 WIDE = 3.0
 """Ratio of width to height from which communicators stand side by side."""
 
@@ -102,9 +106,22 @@ def plot_film(film: Film, people: Sequence[str], frames: int = FRAMES) -> Pictur
         one = (len(steps), 1) if side_by_side else (1, len(steps))
         for ax, step in zip(part.subplots(*one, squeeze=False).flat, steps, strict=True):
             _frame(ax, film, strip, step, characters)
-    if film.domain.picture_legend:
-        figure.supxlabel(film.domain.picture_legend, fontsize=9, color=GREY)
+    legend = textwrap.fill(_legend(film.domain), int(CHARACTERS * figure.get_figwidth()))
+    if legend:
+        figure.supxlabel(legend, fontsize=9, color=GREY)
     return figure
+
+
+def _legend(domain: Domain) -> str:
+    """Return the world's own sentence about its pictures, or one about `World.render`."""
+    if domain.picture_legend or offers(domain, "render"):
+        return domain.picture_legend
+    (visual,) = (modality for modality in domain.modalities if modality.name == VISUAL)
+    return (
+        f"Rows from above: {', '.join(visual.items)}. Columns from the left: "
+        f"{', '.join(visual.features)}; darker for larger numbers. Tinted: what the person neither "
+        "sees nor is shown at this step"
+    )
 
 
 def _steps(film: Film, frames: int) -> list[int]:

@@ -1,22 +1,27 @@
 """Filmstrips: rounds played back from logs, the choice of a round, of steps, and the picture."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
+from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.domains.base import map_state, total_reward
 from mirror_ppl.domains.driving import Driving
 from mirror_ppl.domains.driving.people import TaskDrivers
 from mirror_ppl.domains.highway.pictures import UNSEEN
+from mirror_ppl.domains.registry import load_world
 from mirror_ppl.errors import OptionError
 from mirror_ppl.evaluation.assistance import Listener, PlannerOptions, listeners, play, speaker
 from mirror_ppl.evaluation.film import compared, film, strip
 from mirror_ppl.people import draw_starts, simulated_people
-from mirror_ppl.plots.film import Film, plot_film
+from mirror_ppl.plots.film import Film, Strip, plot_film
 
 DOMAIN = Driving()
+ROUND_TABLE = Path(__file__).parents[2] / "docs" / "examples" / "round_table.py"
 
 
 @pytest.fixture(scope="module")
@@ -150,6 +155,49 @@ def test_a_film_of_the_highway_shows_what_the_driver_sees():
     grey = [(image[..., :3] == UNSEEN).all(-1).sum() for image in (first, second)]
     assert grey[0] > grey[1] > 0
     assert any("dark grey: not seen" in text.get_text() for text in figure.texts)
+
+
+def test_a_film_of_search_and_rescue_darkens_what_is_not_seen():
+    world = get_domain("search_rescue")
+    state = map_state(lambda part: part[0], world.initial(1, torch.Generator(), torch.tensor([0])))
+    seen = {"visual": torch.arange(9) == 7, "verbal": torch.zeros(5, dtype=torch.bool)}
+    whole, part = world.render(state), world.render_seen(state, seen)
+    bright = np.zeros((108, 108), dtype=bool)
+    bright[72:108, 36:72] = True  # bottom-middle, where rounds begin
+    assert np.array_equal(part[bright], whole[bright])
+    dark = ~bright
+    assert np.abs(part[dark] - 0.6 * whole[dark]).max() <= 1  # both are rounded
+    assert np.array_equal(whole, world.render_seen(state, {"visual": torch.ones(9).bool()}))
+
+
+def test_every_world_of_the_package_explains_its_pictures():
+    assert all(world.picture_legend for world in DOMAINS.values())
+
+
+def test_a_world_without_pictures_of_its_own_has_a_table_and_explains_it(listener, played):
+    world = load_world(f"{ROUND_TABLE}:RoundTable")
+    state = map_state(lambda part: part[0], world.initial(1, torch.Generator().manual_seed(0)))
+    visual = next(one for one in world.modalities if one.name == "visual")
+    mask = torch.arange(len(visual.items)) == 1
+    whole, part = world.render(state), world.render_seen(state, {"visual": mask})
+    size = len(whole) // len(visual.items)
+    assert np.array_equal(part[size : 2 * size], whole[size : 2 * size])
+    assert np.array_equal(part[:size, ..., 2], (0.6 * whole[:size, ..., 2]).astype(np.uint8))
+    assert (part[:size, ..., 0] == whole[:size, ..., 0]).all()
+
+    class Pictured(type(world)):
+        def render(self, state):
+            return super().render(state)
+
+    def below(domain):
+        everything = {"visual": torch.ones(len(visual.items), dtype=torch.bool)}
+        one = Strip("none", [state, state], [everything] * 2, [[]], ["wait"], [0.0], 0.0, [])
+        figure = plot_film(Film(domain, 0, 0, (one, one)), ["ann"], frames=2)
+        return [text.get_text().replace("\n", " ") for text in figure.texts]
+
+    (text,) = [text for text in below(world) if text.startswith("Rows from above: ")]
+    assert all(item in text for item in (*visual.items, *visual.features))
+    assert not [text for text in below(Pictured()) if "Rows from above" in text]
 
 
 def people_sees(people, world, state):

@@ -53,6 +53,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.bomb_defusal.drawing import LEGEND, draw_panel
 from mirror_ppl.domains.bomb_defusal.knowledge import BombKnowledge
 from mirror_ppl.domains.bomb_defusal.panel import (
     BUTTONS,
@@ -140,6 +141,7 @@ class BombDefusal(World):
     scenarios: tuple[str, ...] = tuple(f"{kind} bomb" for kind in KINDS)
     reward_terms: tuple[str, ...] = ("right", "wrong", "time")
     mishap: tuple[str, str] = ("wrong", "wrong buttons")
+    picture_legend = LEGEND
     directions: tuple[str, ...] = ("panel",)
     reach_bins: tuple[float, ...] = (0.0,)
     """All people have the same reach: every terminal is in front of them."""
@@ -388,20 +390,5 @@ class BombDefusal(World):
 
     def render(self, state: BombState) -> np.ndarray:
         """Draw ``uint8 [height, width, 3]`` of one state: the terminals, the type, the stage."""
-        cell, gap = 6, 6
-        side = PICTURE[0] * cell
-        columns = TERMINALS // 2
-        height, width = 3 * gap + 2 * side + 12, (columns + 1) * gap + columns * side
-        picture = np.full((height, width, 3), 170, dtype=np.uint8)
-        pixels = self.observe(state)["visual"].unflatten(-1, PICTURE).numpy()
-        for number, terminal in enumerate((255 * pixels).round().astype(np.uint8)):
-            row, column = divmod(number, columns)
-            top, left = gap + row * (side + gap), gap + column * (side + gap)
-            grown = terminal.repeat(cell, 0).repeat(cell, 1)
-            picture[top : top + side, left : left + side] = grown
-        done = int(state.stage)
-        for stage in range(STAGES):
-            left = gap + stage * 14
-            picture[-12:-4, left : left + 10] = (60, 160, 60) if stage < done else (40, 40, 40)
-        picture[-12:-4, -gap - 20 : -gap] = ((220, 120, 40), (60, 120, 220))[int(state.kind)]
-        return picture
+        pixels = self.observe(state)["visual"]
+        return draw_panel(pixels, int(state.stage), int(state.kind))

@@ -61,6 +61,8 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.search_rescue.drawing import LEGEND, draw_house
+from mirror_ppl.domains.search_rescue.estimate import nearest_to, state_of
 from mirror_ppl.domains.search_rescue.house import (
     CORRIDORS,
     ENTRANCE,
@@ -68,7 +70,6 @@ from mirror_ppl.domains.search_rescue.house import (
     PORTIONS,
     ROOMS,
     SIDE,
-    as_image,
     at_entrance,
     portion_centres,
     portion_pixels,
@@ -151,6 +152,7 @@ class SearchRescue(World):
     )
     reward_terms: tuple[str, ...] = ("found", "returned", "collision", "time")
     mishap: tuple[str, str] = ("collision", "collisions")
+    picture_legend = LEGEND
     directions: tuple[str, ...] = ("radius",)
     reach_bins: tuple[float, ...] = reach_distances()
     """Radii in cells, one for each set of radii with equal sight from every place."""
@@ -335,58 +337,12 @@ class SearchRescue(World):
         return torch.zeros_like(distance, dtype=torch.long), distance
 
     def state_behind(self, observation: Observation) -> RescueState:
-        """Return the state ``[...]`` with this full observation.
-
-        The former room of a carried victim cannot be observed and no longer matters.
-        """
-        holds = observation["verbal"][..., 0].round().bool()
-        place = observation["ego"][..., :2].round().long()
-        found = observation["ego"][..., 2].round().bool()
-        sides = torch.arange(1, 1 + len(CORRIDORS), device=place.device)
-        rooms = torch.arange(len(ROOMS), device=place.device)
-        return RescueState(
-            place=place,
-            found=found,
-            home=found & at_entrance(place),
-            blocked=(holds[..., : len(sides)] * sides).sum(-1),
-            victim=(holds[..., len(sides) :] * rooms).sum(-1),
-        )
+        """Return the state ``[...]`` with this full observation; see `state_of`."""
+        return state_of(observation)
 
     def nearest(self, observation: Observation) -> Observation:
-        """Return the possible observation nearest to decoded values.
-
-        Places are rounded to the nearest floor. The scenario is the one with the nearest pixels and
-        utterances.
-        """
-        place = observation["ego"][..., :2]
-        cells = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
-        cells = cells[walkable(cells)].to(place.device)
-        apart = (place[..., None, :] - cells.to(place)).pow(2).sum(-1)
-        carrying = observation["ego"][..., 2] >= 0.5  # noqa: PLR2004 - between no and yes
-        corridors, rooms = 1 + len(CORRIDORS), len(ROOMS)
-        blocked, victim = torch.cartesian_prod(torch.arange(corridors), torch.arange(rooms)).T.to(
-            place.device
-        )
-        batch = carrying.shape
-        candidates = RescueState(
-            place=cells[apart.argmin(-1)][..., None, :].expand(*batch, len(victim), 2),
-            found=carrying[..., None].expand(*batch, len(victim)),
-            home=torch.zeros(*batch, len(victim), dtype=torch.bool, device=place.device),
-            blocked=blocked.expand(*batch, -1),
-            victim=victim.expand(*batch, -1),
-        )
-        possible = self.observe(candidates)
-        unlike = sum(
-            (possible[name] - observation[name][..., None, :, :]).pow(2).flatten(-2).sum(-1)
-            for name in ("visual", "verbal")
-        )
-        best = torch.as_tensor(unlike).argmin(-1)
-
-        def chosen(part: Tensor) -> Tensor:
-            index = best.view(*batch, 1, *(1,) * (part.dim() - len(batch) - 1))
-            return part.take_along_dim(index, len(batch)).squeeze(len(batch))
-
-        return {name: chosen(part) for name, part in possible.items()}
+        """Return the possible observation nearest to decoded values; see `nearest_to`."""
+        return nearest_to(observation, self.observe)
 
     def relevance(self, observation: Observation) -> dict[str, Visibility]:
         """Return the items of the victim and the obstacle (supplement, section F)."""
@@ -420,9 +376,8 @@ class SearchRescue(World):
 
     def render(self, state: RescueState) -> np.ndarray:
         """Draw ``uint8 [height, width, 3]`` of one state: the map, the firefighter in blue."""
-        cell = 12
-        pixels = as_image(self.observe(state)["visual"]).numpy()
-        picture = (255 * pixels).round().astype(np.uint8).repeat(cell, 0).repeat(cell, 1)
-        row, column = (int(part) * cell for part in state.place)
-        picture[row + 2 : row + cell - 2, column + 2 : column + cell - 2] = (40, 90, 200)
-        return picture
+        return draw_house(self.observe(state)["visual"], state.place)
+
+    def render_seen(self, state: RescueState, visible: Visibility) -> np.ndarray:
+        """Draw one state, darkening portions outside of ``visible["visual"]`` ``[9]``."""
+        return draw_house(self.observe(state)["visual"], state.place, visible["visual"])
