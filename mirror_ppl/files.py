@@ -79,7 +79,7 @@ def write_together(
             # systems.
             target = Path(os.path.realpath(path))
             _require_file(target, path)
-            made += _make_folder(target.parent)
+            _make_folder(target.parent, made)
             temporary, file = _locked_temporary(target)
             ready.append((temporary, file, target))
             file.write(content.encode() if isinstance(content, str) else content)
@@ -202,8 +202,9 @@ def output_folder(
     for part in parts:
         if os.path.lexists(folder / part) and not os.path.isdir(folder / part):
             raise OutputError(f"cannot create the folder {folder / part}: there is a file")
-    made = _make_folder(folder)
+    made: list[Path] = []
     try:
+        _make_folder(folder, made)
         for part in ("", *parts):
             _remove_abandoned(folder / part)
         with _sole_use(folder / lock):
@@ -351,32 +352,29 @@ def _held(path: Path) -> BinaryIO | None:
         file.close()
 
 
-def _make_folder(folder: Path) -> list[Path]:
-    """Create the folder and its parents; returns those that were missing, outermost first."""
-    made: list[Path] = []
+def _make_folder(folder: Path, made: list[Path]) -> None:
+    """Create the folder and its parents; adds those that were missing, outermost first."""
     try:
         for step in (*reversed(folder.parents), folder):
             if step.is_dir():
                 continue
+            made.append(step)  # before it is there, so that no interruption leaves it behind
             try:
                 step.mkdir()
             except FileExistsError:
+                made.remove(step)
                 # Fine if another process was quicker, but not if there is a file in the way.
                 if not step.is_dir():
                     code = errno.ENOTDIR
                     raise NotADirectoryError(code, os.strerror(code), str(step)) from None
-            else:
-                made.append(step)
     except (OSError, ValueError) as error:
-        _remove_folders(made)
         raise OutputError(f"cannot create the folder {folder}: {_reason(error)}") from error
-    return made
 
 
 def _remove_folders(made: list[Path]) -> None:
     for folder in reversed(made):
-        # Not empty any more: another process uses it by now.
-        with suppress(OSError):
+        # Not empty any more: another process uses it by now. Or it could not be created.
+        with suppress(OSError, ValueError):
             folder.rmdir()
 
 

@@ -94,6 +94,23 @@ def test_a_failure_leaves_old_files_and_nothing_new(tmp_path, monkeypatch, failu
     assert path.read_text() == "old"
 
 
+@pytest.mark.parametrize("where", ["new", "new/deep"])
+def test_an_interruption_just_after_a_folder_was_made_leaves_none(tmp_path, monkeypatch, where):
+    mkdir = Path.mkdir
+
+    def interrupted(path):
+        mkdir(path)
+        if path == tmp_path / where:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "mkdir", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(tmp_path / "new" / "deep" / "a.txt", "new")
+    with pytest.raises(KeyboardInterrupt), output_folder(tmp_path / "new" / "deep", ["a.txt"]):
+        raise AssertionError("the folder was not reached")
+    assert content(tmp_path) == []
+
+
 def test_files_are_written_together_or_not_at_all(tmp_path, full):
     small, large, stale = (tmp_path / name for name in ("small", "large", "stale"))
     small.write_text("old")
