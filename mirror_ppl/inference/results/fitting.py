@@ -241,7 +241,7 @@ def _attributes(
         "setting": train.setting,
         "human_model": type(human).__name__,
         "likelihood_power": human.likelihood_power,
-        "value_error": f"{human.domain.record.value_error:g}",
+        "value_error": human.domain.record.value_error,
         "self_model": fingerprint(human.self_model),
         "guide": options.engine,
         "refined": options.refine,
