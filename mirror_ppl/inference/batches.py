@@ -44,6 +44,7 @@ def in_batches(job: Job, infer_batch: Callable[[Compiled, Job], Inferred]) -> In
     for some in batches:
         begin, own = some.start, job.of(some)
         own = replace(own, seed=job.seed + begin, checkpoint=files.get(begin))
+        job.report("views", begin, people, "people")
         compiled = compile(
             own.human,
             own.rounds,

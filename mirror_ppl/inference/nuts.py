@@ -57,6 +57,7 @@ def sample_nuts(
         report("sample", min(done, total), total, "")
 
     compiled.refuse_scales("nuts")
+    report("sample", done, total, "")
     with forked(), pyro.validation_enabled(False):
         seed_everything(seed)
         kernel = NUTS(

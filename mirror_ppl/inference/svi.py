@@ -202,6 +202,7 @@ def optimize(
     losses: list[float] = []
     if checkpoint is not None and checkpoint[0].exists():
         losses = _restore(*checkpoint, cast(AutoGuide, guide), optimizer, compiled)
+    report("fit", len(losses), options.steps, "")
     while len(losses) < options.steps:
         # Validate at the first step only: validation takes a third of the time.
         with pyro.validation_enabled(not losses):

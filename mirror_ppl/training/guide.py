@@ -232,6 +232,7 @@ def _optimize(
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.steps)
     by_elbo = ELBOTraining(guide, groups, options.learning_rate)
     best, kept = float("inf"), copy.deepcopy(guide.state_dict())
+    report("train", 0, options.steps, "")
     for step in range(options.steps):
         guide.train()
         # ELBO steps due by now.

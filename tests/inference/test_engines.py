@@ -11,6 +11,7 @@ from running import command
 
 from mirror_ppl.commands import fit, simulate
 from mirror_ppl.errors import CheckpointError, HumanModelError, UnknownNameError
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions
 from mirror_ppl.inference.calibration.study import prior_people
 from mirror_ppl.inference.engines import InferenceOptions, infer, run_identity
 from mirror_ppl.inference.nuts import NUTSOptions
@@ -212,6 +213,30 @@ class Peeking(ToyHuman):
         far = (implants["reach"] > 3)[..., None]
         seen = torch.where(far, 1.0, belief)
         return super().act(implants, seen, values)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        InferenceOptions("svi", 10, SVIOptions(steps=3)),
+        InferenceOptions("nuts", 4, NUTSOptions(warmup=2)),
+        InferenceOptions("importance", 10, ImportanceOptions(stages=0)),
+        InferenceOptions("importance", 10, ImportanceOptions(stages=0), pooling="partial"),
+    ],
+    ids=["svi", "nuts", "importance", "pooled"],
+)
+def test_progress_of_new_work_begins_at_none(toy, recordings, options):
+    """What is done at the first report is taken for that of an earlier run."""
+    first, last = {}, {}
+
+    def report(name, done, total, unit):
+        del unit
+        first.setdefault(name, done)
+        last[name] = done, total
+
+    infer(toy, recordings, options, 0, report=report)
+    assert first and not any(first.values())
+    assert all(done == total for done, total in last.values())
 
 
 # --- what is refused --------------------------------------------------------------------------

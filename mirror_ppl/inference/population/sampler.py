@@ -102,6 +102,7 @@ def sample_population(
     everybody = torch.arange(len(place), device=place.device)
     kept: list[tuple[dict[str, Tensor], Tensor, Tensor]] = []
     total = WARMUP + THIN * number
+    report(0, total)
     with forked():
         seed_everything(seed)
         weights = torch.ones_like(log_prior)
