@@ -61,9 +61,9 @@ def check_world(demonstrations: Demonstrations, allowed: float = 0.0) -> Contrad
         The number of steps that do.
 
     Raises:
-        DemonstrationsError: a round is too long, an observation is impossible, or too many steps
-            contradict each other; the message says where the first is, what was expected and what
-            was found.
+        DemonstrationsError: a round is too long or goes on when the task is done, an observation is
+            impossible, or too many steps contradict each other; the message says where the first
+            is, what was expected and what was found.
     """
     wrong = []
     for person in range(demonstrations.num_people):  # one by one, to bound memory
@@ -99,7 +99,8 @@ def check_observations(demonstrations: Demonstrations) -> None:
     """Check that each observation is possible in the domain's world, and no round too long.
 
     Raises:
-        DemonstrationsError: one is not; the message names it and the rule that it breaks.
+        DemonstrationsError: one is not, or actions follow when the task is done; the message names
+            it and the rule that it breaks.
     """
     for person in range(demonstrations.num_people):
         _check_observations(demonstrations, person, _observation(demonstrations, person))
@@ -125,6 +126,14 @@ def _check_observations(
             raise DemonstrationsError(
                 f"person {demonstrations.people[person]!r}, round {number}, time {time}: {rule}"
             )
+    late = (domain.ended(observation) & (times < lengths)).nonzero()
+    if len(late):
+        number, time = late[0].tolist()
+        raise DemonstrationsError(
+            f"person {demonstrations.people[person]!r}, round {number}: the task is done at time "
+            f"{time}, but {int(lengths[number]) - time} more actions follow; length has to be the "
+            "number of actions until then"
+        )
 
 
 def _wrong(

@@ -113,6 +113,7 @@ def to_dataset(demonstrations: Demonstrations) -> xr.Dataset:
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
             "domain": domain.name,
+            "domain_version": domain.version,
             "setting": demonstrations.setting,
             **demonstrations.provenance,
         },
@@ -147,6 +148,13 @@ def from_dataset(
     setting = require_known(
         _agreed(dataset, "setting", setting), "setting", world.settings, world.name
     )
+    version = str(dataset.attrs.get("domain_version", world.version))
+    if version != world.version:
+        raise DemonstrationsError(
+            f"the recordings are of version {version} of {domain_name}, expected {world.version}; "
+            "rounds of another version may mean something else"
+        )
+    _check_meaning(dataset, world)
     dataset = _in_order(dataset, schema.dimension_labels(world))
     dimensions = schema.variable_dimensions(world)
     for name in map(str, dataset.data_vars):
@@ -155,13 +163,6 @@ def from_dataset(
         elif name.startswith(TOLD) and name not in dimensions:
             known = ", ".join(other for other in dimensions if other.startswith(TOLD))
             raise DemonstrationsError(f"unknown variable {name}, expected {known}")
-    for name in ("action", "scenario"):
-        expected = _attributes(world, name)["flag_meanings"]
-        given = dataset[name].attrs.get("flag_meanings") if name in dataset else None
-        if given is not None and str(given) != expected:
-            raise DemonstrationsError(
-                f"flag_meanings of {name} are {str(given)!r}, expected {expected!r}"
-            )
     variables = {
         name: _tensor(dataset[name], dims)
         for name, dims in dimensions.items()
@@ -191,6 +192,21 @@ def _agreed(dataset: xr.Dataset, name: str, wanted: str | None) -> str:
     if given is not None and wanted is not None and str(given) != wanted:
         raise DemonstrationsError(f"attribute {name} is {str(given)!r}, expected {wanted!r}")
     return str(given) if wanted is None else wanted
+
+
+def _check_meaning(dataset: xr.Dataset, world: Domain) -> None:
+    """Refuse numbers that mean something else by what the dataset says of them."""
+    kinds = dict.fromkeys(("action", "scenario"), "flag_meanings")
+    kinds |= dict.fromkeys((modality.name for modality in world.modalities), "units")
+    for name, kind in kinds.items():
+        given = dataset[name].attrs.get(kind) if name in dataset else None
+        expected = _attributes(world, name)[kind]
+        if given is not None and str(given) != expected:
+            raise DemonstrationsError(f"{kind} of {name} are {str(given)!r}, expected {expected!r}")
+    for name in ("round", "step", "time"):
+        values = dataset[name].values if name in dataset.coords else np.empty(0)
+        if values.dtype.kind in "iuf" and values.ndim == 1 and not (np.diff(values) > 0).all():
+            raise DemonstrationsError(f"the coordinate {name} does not increase")
 
 
 def _in_order(dataset: xr.Dataset, labels: Mapping[str, tuple[str, ...]]) -> xr.Dataset:
@@ -292,6 +308,6 @@ def _flags(names: tuple[str, ...]) -> dict[str, object]:
     """Names of whole numbers by the CF conventions: words, separated by spaces."""
     words = [re.sub(r"[^\w.+@-]+", "_", name) for name in names]
     return {
-        "flag_values": np.arange(len(names), dtype=np.int8),
+        "flag_values": _smallest(np.arange(len(names))),
         "flag_meanings": " ".join(words),
     }

@@ -11,6 +11,7 @@ import numpy as np
 from mirror_ppl.errors import DemonstrationsError, is_name, shown
 
 DESCRIPTION = ("title", "Conventions", "format", "format_version", "domain", "setting")
+DESCRIPTION += ("domain_version",)
 """Attributes of a file that describe it; all others are provenance."""
 RESERVED = ("NAME", "CLASS", "DIMENSION_LIST", "REFERENCE_LIST", "_NCProperties", "_nc3_strict")
 RESERVED += ("_Netcdf4Dimid", "_Netcdf4Coordinates")

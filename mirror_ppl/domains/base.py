@@ -340,6 +340,10 @@ class Domain(Protocol):
         """Return the state ``[...]`` with this full observation."""
         ...
 
+    def ended(self, observation: Observation) -> Tensor:
+        """Return where ``[...]`` the task is certainly done, so that rounds end there."""
+        ...
+
     def next_observation(self, observation: Observation, action: Tensor) -> Observation:
         """Return the full observation after an action ``[...]``; NaN where it is random.
 

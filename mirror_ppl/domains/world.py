@@ -299,6 +299,12 @@ class World(ABC):
             far = torch.ones_like(items[..., 0])
         return torch.zeros_like(far, dtype=torch.long), far
 
+    def ended(self, observation: Observation) -> Tensor:
+        """Return where ``[...]`` the task is done: `over`, but nowhere if ``partly_observed``."""
+        if self.partly_observed:
+            return torch.zeros_like(observation["ego"][..., 0], dtype=torch.bool)
+        return self.over(self.state_behind(observation))
+
     def next_observation(self, observation: Observation, action: Tensor) -> Observation:
         """Return the full observation after an action ``[...]``; NaN where it is not determined."""
         if self.partly_observed or self.random:

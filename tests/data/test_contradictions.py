@@ -179,6 +179,62 @@ def test_rounds_longer_than_those_of_the_world_are_refused(check):
         check(long)
 
 
+def going_on(rounds, more):
+    """Rounds in which people take the first action after the task was done."""
+    lengths = (rounds.lengths + more).clamp(max=rounds.actions.shape[2])
+    times = torch.arange(rounds.actions.shape[2] + 1)
+    mask = times[:-1] < lengths[..., None]
+
+    def held(value):
+        last = value.gather(
+            2, _at(rounds.lengths, value).expand(*value.shape[:2], 1, *value.shape[3:])
+        )
+        late = (times > rounds.lengths[..., None]) & (times <= lengths[..., None])
+        return torch.where(late.view(*late.shape, *(1,) * (value.dim() - 3)), last, value)
+
+    return replace(
+        rounds,
+        lengths=lengths,
+        actions=torch.where(mask & (rounds.actions < 0), 0, rounds.actions),
+        ego=held(rounds.ego),
+        observations={name: held(value) for name, value in rounds.observations.items()},
+        told={},
+        rewards=None,
+        action_entropy=None,
+    )
+
+
+def _at(lengths, value):
+    return lengths.view(*lengths.shape, 1, *(1,) * (value.dim() - 3))
+
+
+@pytest.mark.parametrize("check", [check_world, check_observations])
+@pytest.mark.parametrize("name", ["bomb_defusal_unlabelled_diverse", "search_rescue_smoke_diverse"])
+def test_actions_after_the_task_is_done_are_refused(check, name):
+    rounds = recorded(name)
+    domain = get_domain(rounds.domain)
+    done = domain.ended(rounds.observation())
+    real = torch.arange(done.shape[2]) < rounds.lengths[..., None]
+    assert not (done & real).any()
+    person, number = (rounds.lengths <= domain.horizon - 2).nonzero()[0].tolist()
+    time = int(rounds.lengths[person, number])
+    with pytest.raises(DemonstrationsError) as error:
+        check(going_on(rounds.select_people([person]), 2))
+    assert str(error.value) == (
+        f"person '{rounds.people[person]}', round {number}: the task is done at time {time}, but 2 "
+        "more actions follow; length has to be the number of actions until then"
+    )
+
+
+def test_a_round_on_the_highway_ends_with_an_accident():
+    rounds = recorded("highway_fog_diverse").select_people([0])
+    assert check_world(rounds)
+    ego = rounds.ego.clone()
+    ego[0, 1, 40, -1] = 1.0
+    text = "round 1: the task is done at time 40, but 8 more actions follow"
+    assert text in refused(replace(rounds, ego=ego))
+
+
 def test_a_share_of_contradictions_may_be_allowed():
     rounds = noisy()
     assert int(rounds.mask.sum()) == 150

@@ -26,6 +26,7 @@ from mirror_ppl.data import (
     schema,
     to_dataset,
 )
+from mirror_ppl.data.files import _flags
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import AssetError, DemonstrationsError, OutputError, UnknownNameError
 
@@ -111,6 +112,7 @@ def test_a_file_explains_itself(ragged, path):
             "format": "mirror_ppl demonstrations",
             "format_version": "1",
             "domain": "driving",
+            "domain_version": "1",
             "setting": "fog",
             "command": "test",
             "seed": 3,
@@ -245,6 +247,19 @@ BAD_DATASETS = {
         ),
         "flag_meanings of action are 'switch stay', expected 'stay switch'",
     ),
+    "another version of the world": (
+        renamed(domain_version="0"),
+        "the recordings are of version 0 of driving, expected 1; rounds of another version may "
+        "mean something else",
+    ),
+    "other units": (
+        lambda dataset: dataset.assign(visual=dataset.visual.assign_attrs(units="m, lanes")),
+        "units of visual are 'm, lanes', expected 'cells, lanes'",
+    ),
+    "steps backwards": (
+        lambda dataset: dataset.assign_coords(step=[3, 2, 1, 0]),
+        "the coordinate step does not increase",
+    ),
     "nan inside a round": (
         changed("verbal", (0, 0, 3, 1, 2), NAN),
         "person 'a', round 0, time 3: verbal of front-right, relative_speed is nan, "
@@ -278,6 +293,18 @@ def test_bad_files_are_refused_in_one_line_that_names_them(ragged, path, change,
     with pytest.raises(DemonstrationsError) as error:
         load_demonstrations(path)
     assert str(error.value) == f"{path}: {message}"
+
+
+def test_files_from_before_versions_were_kept_are_read(ragged):
+    dataset = to_dataset(ragged)
+    del dataset.attrs["domain_version"]
+    del dataset.visual.attrs["units"]
+    assert from_dataset(dataset.assign_coords(step=[0, 2, 3, 7])).equals(ragged)
+
+
+def test_many_actions_have_flags_of_their_own():
+    found = _flags(tuple(f"action {number}" for number in range(200)))
+    assert found["flag_values"].tolist() == list(range(200))
 
 
 def test_a_posterior_is_not_recordings(path):

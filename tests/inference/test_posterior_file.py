@@ -256,7 +256,6 @@ def test_a_file_that_does_not_say_of_which_domain_it_is(tmp_path, draws):
         ("human_model", "Forgetful", "is of human model Forgetful, not mirror"),
         ("self_model", "0123", "is of self model 0123, not "),
         ("value_error", "0.15", "is of value error 0.15, not 0"),
-        ("value_error", 0.15, "is of value error 0.15, not 0"),
     ],
 )
 def test_draws_of_another_version_or_model(tmp_path, draws, name, other, told):

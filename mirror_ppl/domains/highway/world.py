@@ -187,6 +187,10 @@ class Highway(World):
         """Return an estimate ``[...]``, see :mod:`mirror_ppl.domains.highway.estimate`."""
         return estimate.state_of(observation)
 
+    def ended(self, observation: Observation) -> Tensor:
+        """Return where ``[...]`` there was an accident."""
+        return observation["ego"][..., self.ego_features.index("accident")] == 1
+
     def reference_values(self, state: HighwayState, discount: float) -> Tensor:
         """Return the expert's values ``[..., A]``: of keeping up each manoeuvre for 6 s.
 

@@ -216,6 +216,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     seconds = dict(posterior.seconds)
     add_seconds(seconds, described.seconds)
     summary = attributes | {
+        "value_error": human.domain.record.value_error,
         "options": asdict(options),
         "contradictions": contradictions.as_data(),
         # Of pooled people a population is the prior of most sites.
@@ -241,7 +242,7 @@ def _attributes(
         "setting": train.setting,
         "human_model": type(human).__name__,
         "likelihood_power": human.likelihood_power,
-        "value_error": human.domain.record.value_error,
+        "value_error": f"{human.domain.record.value_error:g}",
         "self_model": fingerprint(human.self_model),
         "guide": options.engine,
         "refined": options.refine,

@@ -27,8 +27,8 @@ from mirror_ppl.randomness import forked
 
 POSTERIOR = "posterior.nc"
 """Name of the file in the folder of a fit."""
-BEFORE = {"value_error": 0.0}
-"""Attributes that files from before they were kept do not have; later they were text."""
+BEFORE = {"value_error": "0"}
+"""Attributes that files from before they were kept do not have."""
 
 
 @dataclass(frozen=True)
@@ -149,8 +149,7 @@ def check_origin(path: Path, attributes: Mapping[str, str], human: HumanModel) -
         ("self_model", fingerprint(human.self_model)),
         ("value_error", f"{human.domain.record.value_error:g}"),
     ):
-        own: str | float | None = attributes.get(name, BEFORE.get(name))
-        own = own if own is None or isinstance(own, str) else f"{own:g}"
+        own = attributes.get(name, BEFORE.get(name))
         if own != mine:
             given = "what it was fitted with"
             if name == "human_model":
