@@ -1,16 +1,17 @@
-"""Code of users: loading of their files, one-line descriptions of faults, what is not theirs."""
+"""Code of users: loading of files, their source, faults in one line, what is not theirs."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib.util
+import inspect
 import os
 import sys
 import traceback
 from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
-from types import FunctionType
+from types import CodeType, FunctionType
 from typing import Any, TypeVar
 
 from mirror_ppl.errors import MirrorError
@@ -161,3 +162,20 @@ def misspelt(kind: type) -> dict[str, str]:
         if close and not name.startswith("_"):
             found[name] = close[0]
     return found
+
+
+def source_of(kind: type) -> str:
+    """Source of the file of a class, on all of which the class may depend."""
+    try:
+        return Path(inspect.getfile(kind)).read_text()
+    except (OSError, TypeError):  # a class made in a notebook has no file
+        return repr([(name, _code(member)) for name, member in sorted(vars(kind).items())])
+
+
+def _code(member: Any) -> Any:
+    """Bytecode of a function that was defined in a notebook."""
+    code = member if isinstance(member, CodeType) else getattr(member, "__code__", None)
+    if code is None:
+        return None
+    constants = [_code(one) or repr(one) for one in code.co_consts]
+    return code.co_code.hex(), code.co_names, constants

@@ -87,7 +87,7 @@ class Modality:
         image: rows, columns and colours of an item that is an image; its features are the pixels
             in that order.
         utterances: for spoken items, the sentences about each by the value of its one feature: U
-            sentences per item, for the values 0 to U - 1.
+            sentences per item, all different, for the values 0 to U - 1.
         groups: names of sets of items that are communicated together, with the indices of their
             items; each item is in one of them. Unless given, each item is communicated alone.
     """
@@ -116,6 +116,11 @@ class Modality:
             raise InputError(
                 f"modality {self.name!r}: each item needs a tuple of its utterances, expected "
                 f"{len(self.items)}, found {len(self.utterances)}"
+            )
+        known = [_heard(sentence) for about in self.utterances for sentence in about]
+        if len({len(about) for about in self.utterances}) > 1 or len(set(known)) < len(known):
+            raise InputError(
+                f"modality {self.name!r}: all items need equally many utterances, all different"
             )
         grouped = sorted(place for _, places in self.groups for place in places)
         if self.groups and grouped != list(range(len(self.items))):
@@ -160,11 +165,15 @@ class Modality:
         if not isinstance(utterance, str):
             raise TypeError(f"an utterance is a string, not {utterance!r}")
         known = [sentence for about in self.utterances for sentence in about]
-        alike = {sentence.lower(): place for place, sentence in enumerate(known)}
-        heard = " ".join(utterance.lower().split())
-        if heard not in alike:
+        places = {_heard(sentence): place for place, sentence in enumerate(known)}
+        if _heard(utterance) not in places:
             raise UnknownNameError.of("utterance", utterance, known)
-        return divmod(alike[heard], len(self.utterances[0]))
+        return divmod(places[_heard(utterance)], len(self.utterances[0]))
+
+
+def _heard(sentence: str) -> str:
+    """A sentence in lower case and with single spaces."""
+    return " ".join(sentence.lower().split())
 
 
 FUTURES = 8

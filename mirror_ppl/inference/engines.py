@@ -7,14 +7,12 @@ Those that compile the program sum out the sites that perception reads.
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from types import CodeType
 from typing import Any
 
 import torch
@@ -41,6 +39,7 @@ from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.progress import Report, silent
 from mirror_ppl.timing import add_seconds, clocked, stage
+from mirror_ppl.user_code import source_of
 from mirror_ppl.version import __version__
 
 ENGINES: Mapping[str, Engine] = {
@@ -306,7 +305,7 @@ FORMAT = 7
 def run_identity(human: HumanModel, network: AmortizedGuide | None, what: Sequence[object]) -> str:
     """Hash of everything results depend on: model with its source, network, options and so on."""
     kinds = [kind for kind in type(human).__mro__ if issubclass(kind, HumanModel)]
-    source = [(kind.__qualname__, _source(kind)) for kind in kinds]
+    source = [(kind.__qualname__, source_of(kind)) for kind in kinds]
     weights = [fingerprint(human), None if network is None else fingerprint(network)]
     try:  # changes in code that the model imports show in its densities
         said = said_of_made_up_rounds(human)
@@ -318,20 +317,3 @@ def run_identity(human: HumanModel, network: AmortizedGuide | None, what: Sequen
     own = [human.likelihood_power, record.consistency, record.value_error, *map(str, what)]
     description = [weights, source, said, __version__, FORMAT, own]
     return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
-
-
-def _source(kind: type) -> str:
-    """Source of the file of a class, on all of which the class may depend."""
-    try:
-        return Path(inspect.getfile(kind)).read_text()
-    except (OSError, TypeError):  # a class made in a notebook has no file
-        return repr([(name, _code(member)) for name, member in sorted(vars(kind).items())])
-
-
-def _code(member: Any) -> Any:
-    """Bytecode of a function that was defined in a notebook."""
-    code = member if isinstance(member, CodeType) else getattr(member, "__code__", None)
-    if code is None:
-        return None
-    constants = [_code(one) or repr(one) for one in code.co_consts]
-    return code.co_code.hex(), code.co_names, constants

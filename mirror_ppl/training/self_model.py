@@ -42,6 +42,8 @@ from mirror_ppl.training.experience import Course, drive, experience
 from mirror_ppl.training.self_model_loss import self_model_loss
 from mirror_ppl.training.self_model_options import SelfModelOptions, require_fitting
 from mirror_ppl.training.views import draw_views
+from mirror_ppl.user_code import source_of
+from mirror_ppl.version import __version__
 
 VALUED = 1024
 """States of which values are computed at once; bounds memory."""
@@ -111,6 +113,8 @@ class _Trainer:
             )
         self.domain = domain
         self.options = options
+        of_kind = [one for one in kind.__mro__ if issubclass(one, SelfModel)]
+        given = {name: value for name, value in vars(domain).items() if name[0] != "_"}
         self.run_id = {
             "domain": domain.name,
             "domain_version": domain.version,
@@ -119,7 +123,9 @@ class _Trainer:
             "seed": seed,
             "speech": speech,
             "sizes": asdict(sizes),
-            "kind": kind.__name__,
+            "kind": [(one.__qualname__, source_of(one)) for one in of_kind],
+            "given": {name: value for name, value in given.items() if _is_plain(value)},
+            "version": __version__,
         }
         self.generator = generator
         embedding = EMBEDDINGS[speech]
@@ -150,11 +156,7 @@ class _Trainer:
             report(self.phase, message)
 
     def _save(self, path: Path) -> None:
-        # Integers of a world are small.
-        starts = [
-            map_state(lambda part: part.int() if part.dtype == torch.long else part, start)
-            for start in self.starts
-        ]
+        starts = [map_state(_smaller, start) for start in self.starts]
         content = {
             "phase": self.phase,
             "self_model": self.self_model.state_dict(),
@@ -166,6 +168,8 @@ class _Trainer:
             "generator": self.generator.get_state(),
             "torch": torch.random.get_rng_state(),
         }
+        if self.generator.device.type == "cuda":
+            content["cuda"] = torch.cuda.get_rng_state(self.generator.device)
         save_checkpoint(path, self.run_id, content)
 
     def _restore(self, path: Path) -> None:
@@ -174,20 +178,17 @@ class _Trainer:
         self.target.load_state_dict(content["target"])
         self.optimizer.load_state_dict(content["optimizer"])
         self.schedule.load_state_dict(content["schedule"])
-        kind = type(self.domain.initial(1, torch.Generator(self.generator.device)))
+        like = self.domain.initial(1, torch.Generator(self.generator.device))
         self.starts = [
-            kind(
-                **{
-                    name: part.long() if part.dtype == torch.int32 else part
-                    for name, part in start.items()
-                }
-            )
+            map_state(lambda part, own: part.to(own.dtype), type(like)(**start), like)
             for start in content["starts"]
         ]
         self.actions = [actions.long() for actions in content["actions"]]
         self.phase = content["phase"]
         self.generator.set_state(content["generator"])
         torch.random.set_rng_state(content["torch"])
+        if "cuda" in content:
+            torch.cuda.set_rng_state(content["cuda"], self.generator.device)
 
     def _drive(self) -> None:
         options, domain = self.options, self.domain
@@ -324,3 +325,20 @@ class _Trainer:
         pairs = zip(self.target.parameters(), self.self_model.q_network.parameters(), strict=True)
         for slow, fast in pairs:
             slow.lerp_(fast, self.options.target_rate)
+
+
+def _is_plain(value: object) -> bool:
+    """True of numbers, texts, and tuples, lists and dicts of them."""
+    if isinstance(value, dict):
+        return all(_is_plain(part) for pair in value.items() for part in pair)
+    if isinstance(value, tuple | list):
+        return all(map(_is_plain, value))
+    return value is None or type(value) in (str, int, float, bool)
+
+
+def _smaller(part: Tensor) -> Tensor:
+    """Whole numbers in 32 bits, if they fit."""
+    limits = torch.iinfo(torch.int32)
+    whole = part.dtype == torch.long and part.numel()
+    fits = whole and limits.min <= int(part.min()) and int(part.max()) <= limits.max
+    return part.int() if fits else part

@@ -265,3 +265,13 @@ def test_modalities_have_to_fit_together():
         Modality("visual", ("a",), ("x",), ("1",), (1.0,), 0.1, image=(3, 3, 1))
     with pytest.raises(ValueError, match="each item needs a tuple of its utterances"):
         Modality("verbal", ("a",), ("x",), ("1",), (1.0,), 0.1, utterances=(("a",), ("b",)))
+
+
+@pytest.mark.parametrize(
+    "about",
+    [(("free", "blocked", "afar"), ("there", "gone")), (("free", "blocked"), ("Free ", "x"))],
+)
+def test_utterances_that_could_be_confused_are_refused(about):
+    text = "all items need equally many utterances, all different"
+    with pytest.raises(ValueError, match=text):
+        Modality("verbal", ("a", "b"), ("x",), ("1",), (1.0,), 0.1, utterances=about)

@@ -9,7 +9,9 @@ import torch
 from example_experience import STAY4, two_cars_near
 
 from mirror_ppl.domains import get_domain
-from mirror_ppl.domains.base import map_state
+from mirror_ppl.domains.base import map_state, tensors_of
+from mirror_ppl.domains.bomb_defusal.panel import OLD_RULES, RULES
+from mirror_ppl.domains.bomb_defusal.world import BombDefusal
 from mirror_ppl.domains.driving import Driving
 from mirror_ppl.domains.highway import Highway
 from mirror_ppl.domains.world import World
@@ -333,6 +335,43 @@ def test_training_goes_on_from_its_checkpoint_as_if_never_stopped(options, tmp_p
     resumed = train(options=options, report=report, checkpoint=path)
     assert phases == [3]
     assert_same(resumed, train(options=options))
+
+
+def trainer(domain=DRIVING, kind=SelfModel):
+    generator = torch.Generator().manual_seed(0)
+    return _Trainer(domain, TINY, generator, 0, "words", sizes_of(domain), kind)
+
+
+@pytest.mark.parametrize("large", [0, 2**40, -(2**40)])
+def test_states_are_kept_exactly(large, tmp_path):
+    one, other = trainer(), trainer()
+    start = DRIVING.initial(4, torch.Generator().manual_seed(0))
+    one.starts = [replace(start, position=start.position + large)]
+    one._save(tmp_path / "a")
+    other._restore(tmp_path / "a")
+    for kept, part in zip(tensors_of(other.starts[0]), tensors_of(one.starts[0]), strict=True):
+        assert kept.dtype == part.dtype and torch.equal(kept, part)
+
+
+def test_checkpoint_of_another_world_or_class_is_refused(tmp_path):
+    def mine(factor):
+        """A class as a notebook defines it, without a file."""
+        names = {"__name__": "notebook", "SelfModel": SelfModel}
+        exec(
+            "class Mine(SelfModel):\n"
+            "    def action_values(self, belief):\n"
+            f"        return {factor} * SelfModel.action_values(self, belief)\n",
+            names,
+        )
+        return names["Mine"]
+
+    bomb = BombDefusal(OLD_RULES), BombDefusal(RULES)
+    pairs = [map(trainer, bomb), (trainer(kind=mine(factor)) for factor in (1, 100))]
+    for number, (one, another) in enumerate(pairs):
+        one._save(tmp_path / str(number))
+        one._restore(tmp_path / str(number))
+        with pytest.raises(CheckpointError, match="belongs to a run with other options"):
+            another._restore(tmp_path / str(number))
 
 
 def test_some_rounds_are_kept_as_they_were_believed():
