@@ -168,6 +168,7 @@ def main(options: Options) -> None:
     pairing = _pairing(options, posterior, source, people)
     pairing.check()
     chosen = _possible(options, chosen, pairing)
+    _warn_of_unused(options, chosen, pairing.planner.predict_with)
     _warn_of_unexplained_people(pairing, chosen)
     parts = None if kept is None else kept.with_name(f".{kept.name}.parts")
     cells = turns(chosen, people)
@@ -281,6 +282,23 @@ def _possible(options: Options, chosen: tuple[str, ...], pairing: Pairing) -> tu
             file=sys.stderr,
         )
     return chosen
+
+
+def _warn_of_unused(options: Options, chosen: Sequence[str], predict_with: str) -> None:
+    """Print which options no chosen communicator uses; the oracle may be a planner."""
+    ahead = {LEARNED, "oracle"} | ({"mirror", "random"} if predict_with != "values" else set())
+    uses = {
+        "horizon": ahead,
+        "discount": ahead,
+        "patience": ahead,
+        "enumerate_above": ahead,
+        "kl_weight": {KL},
+        "kl_measure": {KL},
+    }
+    for name, users in uses.items():
+        if getattr(options, name) is not None and users.isdisjoint(chosen):
+            option = f"--{name.replace('_', '-')}"
+            print(f"warning: {option} has no effect on {', '.join(chosen)}", file=sys.stderr)
 
 
 def _contents(

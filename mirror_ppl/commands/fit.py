@@ -88,8 +88,8 @@ class Options:
     explore: int = 8
     """Rounds that are simulated of each scenario, to find the one that is most informative about
     what people see; 0 leaves it out."""
-    steps: int = 300
-    """Gradient steps of svi."""
+    steps: int | None = None
+    """Gradient steps of svi; 300 unless given."""
     refine: int = 0
     """Of auto and amortized: gradient steps on each person's rounds that refine what the network
     proposes; none unless given."""
@@ -116,6 +116,8 @@ class Options:
         if self.refine and self.guide not in ("auto", "amortized"):
             raise OptionError("--refine is for --guide auto and amortized")
         check_numbers(self, "steps", "draws", "train_rounds", "explore", "refine", "seed", "jobs")
+        if self.steps is not None and self.guide != "svi":
+            raise OptionError("--steps is for --guide svi")
         share(self.allow_contradictions, "--allow-contradictions")
 
 
@@ -152,7 +154,7 @@ def main(options: Options) -> None:
             seed=options.seed,
             draws=options.draws,
             train_rounds=options.train_rounds,
-            settings=SVIOptions(steps=options.steps) if engine == "svi" else None,
+            settings=None if options.steps is None else SVIOptions(steps=options.steps),
             refine=options.refine,
             explore=options.explore,
             allow_contradictions=allowed,

@@ -86,9 +86,14 @@ def main(options: Options) -> None:
     from mirror_ppl.data import save_demonstrations
     from mirror_ppl.domains import get_domain
     from mirror_ppl.files import lock_of, output_folder
-    from mirror_ppl.people import simulate
+    from mirror_ppl.people import people_of, simulate
 
     domain = get_domain(options.domain)
+    if options.self_model is not None and options.human_model is None and people_of(domain.name):
+        raise OptionError(
+            f"--self-model has no effect on the simulated people of {domain.name}, who are not "
+            "made of it; leave it out"
+        )
     setting = domain.settings[-1] if options.setting is None else options.setting
     device = usable_device(options.device)
     require_memory(_bytes(options), "rounds of so many people")

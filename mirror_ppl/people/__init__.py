@@ -151,15 +151,16 @@ def simulate(  # noqa: PLR0913 - everything recordings can depend on
     Returns:
         P people with B rounds each, which end when the task is done. Their true values are
         ``sight_...`` for each of the domain's directions (how far the person sees, in the domain's
-        unit of distance; the last of ``reach_bins`` is everything), ``assumes_...`` for each of the
-        domain's assumptions (1: made); in driving ``consistency`` (1 / units of reward), in search
-        and rescue ``lapse`` (probability of a step in a random direction), in bomb defusal
-        ``notices_...`` for each terminal (probability of finding it at a step).
+        unit of distance; the last of ``reach_bins`` is everything), in driving and on the highway
+        ``assumes_...`` for each assumption (1: made); in driving ``consistency`` (1 / units of
+        reward), in search and rescue ``lapse`` (probability of a step in a random direction), in
+        bomb defusal ``notices_...`` for each terminal (probability of finding it at a step).
 
     Raises:
         UnknownNameError: there is no such domain, setting, population or device.
         AssetError: a user's world has no self-model.
-        InputError: fewer than one person or round, no seed, or ``told`` is no probability.
+        InputError: fewer than one person or round, no seed, ``told`` is no probability, or a
+            ``self_model`` for people who are not made of one.
     """
     world = get_domain(domain)
     require_known(population, "population", populations_of(domain), domain)
@@ -167,6 +168,8 @@ def simulate(  # noqa: PLR0913 - everything recordings can depend on
     people, rounds = whole_number(people, "people", 1), whole_number(rounds, "rounds", 1)
     seed, told = seed_number(seed), real_number(told, "told", 0, 1)
     usable_device(str(device))
+    if self_model is not None and people_of(world.name) is not None:
+        raise InputError(f"people of {world.name} are not made of a self_model")
     own = simulated_people(world.name, setting, population, people, seed, device, self_model)
     return recorded(own, setting, population, rounds, seed, device, progress, told)
 

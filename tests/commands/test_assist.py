@@ -305,6 +305,28 @@ def test_what_cannot_be_done_is_refused_in_one_line(
     assert content(tmp_path) == []
 
 
+@pytest.mark.parametrize("option", ["horizon", "discount", "patience", "enumerate_above"])
+def test_options_of_planners_that_look_ahead(option, capsys):
+    options = assist.Options(**{option: 1})
+    for chosen in (["mirror"], ["random", "none"], ["mirror-self-model"], ["oracle"]):
+        assist._warn_of_unused(options, chosen, "simulator")
+    assist._warn_of_unused(options, ["mirror-self-model"], "values")
+    assist._warn_of_unused(assist.Options(), ["mirror"], "values")
+    assert capsys.readouterr().err == ""
+    assist._warn_of_unused(options, ["mirror", "mirror-kl"], "values")
+    named = f"--{option.replace('_', '-')}"
+    assert capsys.readouterr().err == f"warning: {named} has no effect on mirror, mirror-kl\n"
+
+
+def test_options_that_nobody_uses_are_named(posterior, capsys):
+    given = "--communicator", "none", "--kl-weight", 3
+    assert command(assist, "--posterior", posterior, *SMALL, *given) == 0
+    warned = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+    assert warned == [
+        f"warning: {one} has no effect on none" for one in ("--horizon", "--kl-weight")
+    ]
+
+
 def test_outputs_that_would_overwrite_are_refused(posterior, tmp_path, capsys):
     before = posterior.read_bytes()
     for args, message in (

@@ -195,6 +195,13 @@ def test_recordings_that_cannot_be_written_leave_nothing(tmp_path, capsys):
     ("module", "args", "message"),
     [
         (fit, ("--steps", "0"), "--steps must be at least 1, not 0"),
+        (fit, ("--steps", "5"), "--steps is for --guide svi"),
+        (
+            simulate,
+            ("--out", "x.nc", "--self-model", "nowhere"),
+            "--self-model has no effect on the simulated people of driving, who are not made of "
+            "it; leave it out",
+        ),
         (fit, ("--draws", "-3"), "--draws must be at least 1, not -3"),
         (fit, ("--train-rounds", "-1"), "--train-rounds must be at least 0, not -1"),
         (fit, ("--explore", "-1"), "--explore must be at least 0, not -1"),

@@ -58,7 +58,7 @@ def results(tmp_path_factory):
         simulate = next(line for _, line in commands() if "simulate" in line and "runs/" in line)
         assert run_command(simulate, "--people", "2", "--rounds", "4") == 0
         example = next(line for _, line in commands() if EXAMPLE in line)
-        small = ("--demos", "runs/people.nc", "--steps", "3", "--draws", "8", "--out", "runs/demo")
+        small = ("--demos", "runs/people.nc", "--draws", "8", "--out", "runs/demo")
         assert run_command(example, *small) == 0
     return folder
 
@@ -97,7 +97,7 @@ def test_python_blocks_run(name, results, monkeypatch):
 
 def test_python_of_the_communicator_runs(results, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    small = ("--demos", f"{results}/runs/people.nc", "--steps", "3", "--draws", "64")
+    small = ("--demos", f"{results}/runs/people.nc", "--draws", "64")
     assert run_command("python -m mirror_ppl.fit", *small, "--out", "runs/demo") == 0
     capsys.readouterr()
     exec("\n".join(blocks(page("docs/communicator.md"), "python")), {"__name__": "page"})
