@@ -5,8 +5,9 @@ sampling; it includes all rounds that were learned from. It is compared under tw
 
 - All people follow one model: log evidences are summed over people (fixed effects).
 - Each person follows one model, and the shares of the models among people have a uniform Dirichlet
-  prior (random effects). Their posterior is approximated by a Dirichlet distribution (Stephan,
-  Penny, Daunizeau, Moran and Friston, *Bayesian model selection for group studies*, 2009).
+  prior (random effects: Stephan, Penny, Daunizeau, Moran and Friston, *Bayesian model selection
+  for group studies*, 2009). Their posterior is sampled, as a Dirichlet distribution that
+  approximates it is too narrow where it is uncertain whom a model describes.
 
 Shapes: M models, P people.
 """
@@ -20,8 +21,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import digamma, log_softmax
-from scipy.stats import beta
 
 from mirror_ppl.evaluation.compared_files import (
     EvidenceFile,
@@ -32,45 +31,55 @@ from mirror_ppl.evaluation.compared_files import (
 
 INTERVAL = 0.9
 """Probability of intervals of shares."""
-STEPS, TOLERANCE = 1000, 1e-6
-"""Most iterations of the approximation, and the change at which it has converged."""
+CHAINS, SWEEPS = 500, 200
+"""Chains that sample the shares, and sweeps of each, of which the second half counts."""
 
 
 @dataclass(frozen=True)
 class Shares:
-    """Approximate posterior of the shares of M models among people.
+    """Posterior of the shares of M models among P people.
 
     Attributes:
-        counts: parameters of the Dirichlet distribution ``[M]``.
+        draws: of the shares, ``[S, M]``.
         followed: probability that each person follows each model ``[P, M]``.
     """
 
-    counts: np.ndarray
+    draws: np.ndarray
     followed: np.ndarray
 
     @property
     def mean(self) -> np.ndarray:
         """Expected shares ``[M]``."""
-        return self.counts / self.counts.sum()
+        return (1 + self.followed.sum(0)) / (len(self.followed) + self.followed.shape[1])
 
     @property
     def interval(self) -> np.ndarray:
         """Central intervals of the shares ``[2, M]``."""
-        edges = [[(1 - INTERVAL) / 2], [(1 + INTERVAL) / 2]]
-        return beta.ppf(edges, self.counts, self.counts.sum() - self.counts)
+        return np.quantile(self.draws, [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], axis=0)
 
 
 def model_shares(log_evidence: np.ndarray) -> Shares:
-    """Infer the shares of models among people from log evidences ``[P, M]``."""
-    prior = np.ones(log_evidence.shape[1])
-    counts, followed = prior, np.empty(0)
-    for _ in range(STEPS):
-        # digamma(counts.sum()) is the same for all models.
-        followed = np.exp(log_softmax(log_evidence + digamma(counts), -1))
-        before, counts = counts, prior + followed.sum(0)
-        if np.abs(counts - before).max() < TOLERANCE:
-            break
-    return Shares(counts, followed)
+    """Infer the shares of models among people from log evidences ``[P, M]``.
+
+    Gibbs sampling draws the model of each person given the shares, and the shares given these, in
+    many chains that begin with the prior.
+    """
+    generator = np.random.default_rng(0)
+    people, models = log_evidence.shape
+    likelihood = np.exp(log_evidence - log_evidence.max(-1, keepdims=True))
+    shares = generator.dirichlet(np.ones(models), CHAINS)
+    draws, followed = [], np.zeros((people, models))
+    for sweep in range(SWEEPS):
+        weights = shares[:, None] * likelihood  # [C, P, M]
+        edges = weights.cumsum(-1)
+        chosen = (edges <= edges[..., -1:] * generator.random((CHAINS, people, 1))).sum(-1)
+        counts = (chosen[..., None] == np.arange(models)).sum(1)
+        drawn = generator.standard_gamma(1 + counts)
+        shares = drawn / drawn.sum(-1, keepdims=True)
+        if sweep >= SWEEPS // 2:
+            followed += (weights / edges[..., -1:]).mean(0)
+            draws.append(shares)
+    return Shares(np.concatenate(draws), followed / len(draws))
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,11 @@ import pytest
 from example_posteriors import ACTIONS, PEOPLE, write
 from refused import refused
 from running import command
-from scipy.special import digamma, softmax
 
 import mirror_ppl
 from mirror_ppl.commands import compare
 from mirror_ppl.evaluation.compared_files import read_evidence
-from mirror_ppl.evaluation.evidence import compare_evidence, model_shares
+from mirror_ppl.evaluation.evidence import CHAINS, SWEEPS, compare_evidence, model_shares
 from mirror_ppl.inference.svi import SVIOptions
 
 QUICK = SVIOptions(steps=2)
@@ -39,11 +38,29 @@ def compared(paths):
 # --- shares of the models among people --------------------------------------------------------
 
 
+def within(draws, level):
+    """What the frequency of an event of this probability may be off by once in a million."""
+    return 4.9 * (level * (1 - level) / draws) ** 0.5
+
+
+def exact(evidence):
+    """Mean and distribution function of the first of two shares, by integration."""
+    share = (np.arange(4000) + 0.5) / 4000
+    one, other = np.exp(evidence - evidence.max(-1, keepdims=True)).T
+    log_density = np.log(share[:, None] * one + (1 - share[:, None]) * other).sum(-1)
+    density = np.exp(log_density - log_density.max())
+    density /= density.sum()
+    return density @ share, lambda value: density[share <= value].sum()
+
+
 def test_equal_evidence_leaves_the_prior():
+    """The share of one of three models has the distribution function 1 - (1 - x)**2."""
     shares = model_shares(np.zeros((6, 3)))
-    np.testing.assert_allclose(shares.followed, 1 / 3)
-    np.testing.assert_allclose(shares.counts, 3)
-    np.testing.assert_allclose(shares.mean, 1 / 3)
+    np.testing.assert_allclose(shares.followed, 1 / 3, atol=0.02)
+    np.testing.assert_allclose(shares.mean, 1 / 3, atol=0.02)
+    low, high = shares.interval
+    np.testing.assert_allclose(1 - (1 - low) ** 2, 0.05, atol=within(CHAINS, 0.05))
+    np.testing.assert_allclose(1 - (1 - high) ** 2, 0.95, atol=within(CHAINS, 0.05))
 
 
 def test_people_who_surely_follow_a_model_are_counted():
@@ -51,22 +68,26 @@ def test_people_who_surely_follow_a_model_are_counted():
     whose distribution function at x is 5 x**4 - 4 x**5."""
     evidence = np.array([[0, -900], [0, -900], [0, -900], [-900, 0.0]])
     shares = model_shares(evidence)
-    np.testing.assert_array_equal(shares.counts, [4, 2])
-    np.testing.assert_array_equal(shares.followed.argmax(1), [0, 0, 0, 1])
+    np.testing.assert_allclose(shares.mean, [4 / 6, 2 / 6])
+    np.testing.assert_array_equal(shares.followed, [[1, 0], [1, 0], [1, 0], [0, 1]])
     low, high = shares.interval[:, 0]
-    assert 5 * low**4 - 4 * low**5 == pytest.approx(0.05)
-    assert 5 * high**4 - 4 * high**5 == pytest.approx(0.95)
+    # Given the models of all people, draws of the shares are independent.
+    bound = within(CHAINS * SWEEPS / 2, 0.05)
+    assert abs(5 * low**4 - 4 * low**5 - 0.05) < bound
+    assert abs(5 * high**4 - 4 * high**5 - 0.95) < bound
     np.testing.assert_allclose(shares.interval[:, 1], [1 - high, 1 - low])
 
 
-def test_shares_solve_the_equations_of_the_approximation(rng):
-    evidence = rng.normal(0, 3, (8, 4)) - 1000
+@pytest.mark.parametrize("spread", [0.3, 1.0, 3.0])
+def test_shares_have_the_exact_posterior(rng, spread):
+    evidence = rng.normal(0, spread, (20, 2)) - 1000
     shares = model_shares(evidence)
-    followed = softmax(evidence + digamma(shares.counts), -1)
-    np.testing.assert_allclose(shares.followed, followed, atol=1e-5)
-    np.testing.assert_allclose(shares.counts, 1 + followed.sum(0), atol=1e-5)
-    order = rng.permutation(4)
-    np.testing.assert_allclose(model_shares(evidence[:, order]).counts, shares.counts[order])
+    mean, distribution = exact(evidence)
+    # As if each chain were one draw, of a spread of at most one half.
+    assert abs(shares.mean[0] - mean) < 4.9 * 0.5 / CHAINS**0.5
+    for level, edge in zip((0.05, 0.95), shares.interval[:, 0], strict=True):
+        assert abs(distribution(edge) - level) < within(CHAINS, level) + 1 / 4000
+    assert abs(model_shares(evidence[:, ::-1]).mean[1] - mean) < 4.9 * 0.5 / CHAINS**0.5
 
 
 # --- comparisons ------------------------------------------------------------------------------
