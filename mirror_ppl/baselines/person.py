@@ -88,9 +88,9 @@ class NetworkPerson(HumanModel, WorldKnowledge):
         return {NETWORK: (torch.arange(number) % self._number)[:, None, None]}
 
     def planning_domain(self, draws: Mapping[str, Tensor]) -> Domain:
-        """The world that was given, or that of the self-model."""
+        """The world that was given, or the one that the robot was taught."""
         del draws
-        return self.domain if self.world is None else self.world
+        return self.domain.as_believed if self.world is None else self.world
 
     def perceive(
         self,

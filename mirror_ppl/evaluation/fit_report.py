@@ -86,9 +86,11 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
     else:
         nll = sum(test["nll"] for test in tested) / len(tested)
         line = f"Held-out actions: {nll:.3f} nats an action on average"
-        floors = [test["floor"] for test in tested if test["floor"] is not None]
-        if floors:
-            line += f", {nll - sum(floors) / len(floors):.3f} above the people's own entropy"
+        above = [test["nll"] - test["floor"] for test in tested if test["floor"] is not None]
+        if above:
+            line += f", {sum(above) / len(above):.3f} above the people's own entropy"
+            if len(above) < len(tested):
+                line += f", which is known of {len(above)} of {len(tested)}"
         print(line)
 
 

@@ -166,11 +166,17 @@ def views_of(domain: Domain, rounds: int, generator: torch.Generator) -> dict[st
 def _agreement(
     self_model: SelfModel, exact: Tensor, start: Any, actions: Tensor, plan: ViewPlan
 ) -> tuple[float, float]:
-    """Share of decisions that are best by exact values ``[B, T, A]``: of all, and of clear ones."""
+    """Share of decisions that are best by exact values ``[B, T, A]``: of all, and of clear ones.
+
+    After the end of a round all actions are equally good, so nothing is decided.
+    """
+    states = roll_out(self_model.domain, start, actions)
+    decides = ~self_model.domain.over(map_state(lambda part: part[:, :-1], states))
     best = robot_values(self_model, start, actions, plan).argmax(-1, keepdim=True)
     agree = exact.gather(-1, best).squeeze(-1) >= exact.amax(-1) - TIE
     stake = exact.amax(-1) - exact.amin(-1)
-    return float(agree.float().mean()), float(agree[stake > CLEAR_DECISION].float().mean())
+    clear = decides & (stake > CLEAR_DECISION)
+    return float(agree[decides].float().mean()), float(agree[clear].float().mean())
 
 
 def robot_values(self_model: SelfModel, start: Any, actions: Tensor, plan: ViewPlan) -> Tensor:

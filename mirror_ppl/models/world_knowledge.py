@@ -63,4 +63,6 @@ def fit_shipped_world(human: HumanModel, setting: str) -> None:
 
 def planning_domain(human: HumanModel, draws: Mapping[str, Tensor]) -> Domain:
     """Return the domain in which the robot plans for a person with draws ``[S, 1, 1, ...]``."""
-    return human.planning_domain(draws) if isinstance(human, WorldKnowledge) else human.domain
+    if isinstance(human, WorldKnowledge):
+        return human.planning_domain(draws)
+    return human.domain.as_believed  # nothing is learned of the world beside what was taught

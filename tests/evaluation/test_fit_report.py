@@ -144,3 +144,12 @@ def test_what_was_not_held_out_is_not_judged(capsys):
     summary = {"people": [person(2)]}
     assert "No rounds were held out" in shown(capsys, **summary)
     assert "0.250 nats an action on average, 0.125 above" in shown(capsys)
+
+
+def test_the_excess_over_entropies_is_of_those_whose_entropy_is_known(capsys):
+    first, second = person(1), person(2)
+    second["test"] = first["test"] | {"nll": 1.25, "floor": None}
+    out = shown(capsys, people=[first, second])
+    assert "0.750 nats an action on average, 0.125 above the people's own entropy, which is" in out
+    assert "which is known of 1 of 2" in out
+    assert "known of" not in shown(capsys, people=[first])

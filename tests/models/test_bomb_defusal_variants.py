@@ -5,12 +5,14 @@ import torch
 from example_bomb import WORLD, course, implants
 from example_course import beliefs_of, gone_through, perceived
 
+from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal.human import RULE, BombDefusalHuman
 from mirror_ppl.domains.bomb_defusal.panel import RULES
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.world_knowledge import planning_domain
 from mirror_ppl.people import simulate
 
 SEARCH = {
@@ -94,6 +96,16 @@ def test_what_rewards_identify_of_the_world_needs_no_implant(robot):
     human.fit_world(simulate("bomb_defusal", "labelled", "paper", 3, rounds=20, seed=0))
     world = human.planning_domain({})
     assert world.rules == RULES  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_models_that_learn_nothing_of_the_world_plan_in_the_one_that_was_taught(robot):
+    taught = robot.domain.as_believed
+    assert taught.rules != RULES  # pyright: ignore[reportAttributeAccessIssue]
+    for name in ("per-item", "no-implants"):
+        world = planning_domain(variant(name, robot), {})
+        assert world.rules == taught.rules  # pyright: ignore[reportAttributeAccessIssue]
+    driver = variant("mirror", SelfModel(get_domain("driving")))
+    assert planning_domain(driver, {}) is driver.domain
 
 
 def test_draws_of_rules_go_before_what_was_learned(robot):

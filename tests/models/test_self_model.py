@@ -12,7 +12,11 @@ from torch.distributions import Normal
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import ROAD_END
 from mirror_ppl.evaluation.self_model import (
+    TIE,
+    _agreement,
+    exact_values,
     fixed_views,
+    robot_values,
 )
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -255,3 +259,22 @@ def test_what_is_kept_of_rounds_is_what_is_computed():
     assert torch.equal(part.states.position[1], course.states.position[0, 1:4])
     assert torch.equal(part.observation["visual"][0], course.observation["visual"][0, 1:4])
     assert torch.equal(part.rewards[0], course.rewards[0, 1:3])
+
+
+def test_nothing_is_decided_after_the_end():
+    domain = get_domain("search_rescue")
+    self_model, generator = SelfModel(domain), torch.Generator().manual_seed(0)
+    start = domain.initial(8, generator)
+    done = torch.arange(8) >= 4
+    start = replace(start, found=start.found | done, home=start.home | done)
+    actions = torch.randint(4, (8, 5), generator=generator)
+    plan = fixed_views(domain, 8, generator, speech=True)
+    exact = exact_values(domain, start, actions, plan, 0.9)
+    assert (exact[done] == 0).all()
+    agree, clear = _agreement(self_model, exact, start, actions, plan)
+    best = robot_values(self_model, start, actions, plan)[~done].argmax(-1, keepdim=True)
+    own = exact[~done]
+    right = (own.gather(-1, best)[..., 0] >= own.amax(-1) - TIE).float()
+    assert agree == pytest.approx(float(right.mean())) and agree < 0.9
+    at_stake = own.amax(-1) - own.amin(-1) > 0.2
+    assert clear == pytest.approx(float(right[at_stake].mean()))
