@@ -88,7 +88,9 @@ class Objective(Protocol):
 class ExpectedUtility:
     """``U(c) = E[ sum_{h<H} discount^h ( r_{t+h} - cost(c_{t+h}) ) ]``.
 
-    The expectation is over posterior draws, draws of the world, and the person's actions. Action
+    The expectation is over posterior draws, draws of the world, and the person's actions. The cost
+    is that of the whole plan ``c``, also of items that will not be communicable at their step, or
+    where the round will be over by then; such plans are slightly undervalued. Action
     sequences form a tree; those more probable than ``enumerate_above`` are enumerated, the others
     are sampled and reweighted. At 0 the expectation over actions is exact, at 1 each draw follows a
     single action sequence; the estimate is unbiased at every value.

@@ -298,14 +298,19 @@ class _LearnedDynamics:
 
 
 def robot_belief(self_model: SelfModel, past: RoundSoFar) -> Gaussian:
-    """Return ``q(z^R_t | ...)`` of the robot, which sees everything; parameters ``[Z]``."""
+    """Return ``q(z^R_t | ...)`` of the robot, which sees everything; parameters ``[Z]``.
+
+    Where nothing is new (`World.nothing_new`), its belief stays, as people's does.
+    """
     encoder, domain = self_model.encoder, self_model.domain
     everything = {
         m.name: torch.ones_like(past.observation[m.name][..., 0], dtype=torch.bool)
         for m in domain.modalities
     }
     evidence = self_model.evidence(past.observation, everything, past.actions)
+    still = domain.nothing_new(past.observation)
+    new = list(range(past.time + 1)) if still is None else (~still).nonzero().flatten().tolist()
     before = evidence.new_zeros(self_model.latent)
-    if past.time > 0:
-        before = self_model.believe(evidence[:-1])[-1]
-    return encoder(before, evidence[-1])
+    for step in new[:-1]:
+        before = encoder(before, evidence[step]).mean
+    return encoder(before, evidence[new[-1]])

@@ -349,6 +349,10 @@ class Domain(Protocol):
         """Return the state ``[...]`` with this full observation."""
         ...
 
+    def nothing_new(self, observation: Observation) -> Tensor | None:
+        """Return steps ``[T + 1]`` at which who sees everything keeps their belief; None: none."""
+        ...
+
     def ended(self, observation: Observation) -> Tensor:
         """Return where ``[...]`` the task is certainly done, so that rounds end there."""
         ...

@@ -299,6 +299,11 @@ class World(ABC):
             far = torch.ones_like(items[..., 0])
         return torch.zeros_like(far, dtype=torch.long), far
 
+    def nothing_new(self, observation: Observation) -> Tensor | None:
+        """Return steps ``[T + 1]`` at which who sees everything keeps their belief; None: none."""
+        del observation
+        return None
+
     def ended(self, observation: Observation) -> Tensor:
         """Return where ``[...]`` the task is done: `over`, but nowhere if ``partly_observed``."""
         if self.partly_observed:

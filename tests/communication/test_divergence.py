@@ -16,10 +16,20 @@ from example_person import (
 from example_plans import ACTIONS, candidates_of, robot
 from torch.distributions import Independent, Normal, kl_divergence
 
-from mirror_ppl.communication import Divergence, ExpectedUtility, Person, PlanningContext
+from mirror_ppl.communication import (
+    Channels,
+    Divergence,
+    ExpectedUtility,
+    Person,
+    PlanningContext,
+    RoundSoFar,
+)
 from mirror_ppl.communication.objectives import ExpectedValue
 from mirror_ppl.communication.planners import PlannerOptions, planner_of
 from mirror_ppl.errors import HumanModelError, UnknownNameError
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.prior import draw_prior
+from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 
 def told_belief(draw, past, told):
@@ -118,3 +128,27 @@ def test_impossible_measures_are_refused(options, message):
     with pytest.raises(ValueError) as error:
         Divergence(**options)
     assert str(error.value) == message
+
+
+@torch.no_grad()
+def test_beliefs_of_an_unchanged_bomb_do_not_drift_apart():
+    """Who was shown and heard everything believes what the robot believes, however long ago."""
+    model, _ = load_self_model(shipped_weights("bomb_defusal"))
+    bomb = load_human_model(None, model)
+    channels, world = Channels(model.domain), model.domain
+    someone = Person(bomb, draw_prior(bomb, 1, 4, 0))
+    state = world.initial(1, torch.Generator().manual_seed(0))
+    past = RoundSoFar.begin(world, {n: value[0] for n, value in world.observe(state).items()})
+    everything = channels.join(world.communicable(past.now))
+    for step in range(4):
+        silence = torch.zeros(1, 1, len(channels), dtype=torch.bool)
+        value = Divergence().at(PlanningContext.of(someone, past), 5, 0)
+        apart = value(silence).utility
+        assert (apart < -1).any() if step == 0 else (apart.abs() < 1e-3).all()
+        sent = everything if step == 0 else torch.zeros_like(everything)
+        press = 0 if step < 3 else 1  # a new stage begins after the fourth step
+        state = world.transition(state, torch.tensor([press]))
+        now = {n: value[0] for n, value in world.observe(state).items()}
+        past = past.then(channels.split(sent), press, now)
+    apart = Divergence().at(PlanningContext.of(someone, past), 5, 0)(silence).utility
+    assert (apart < -1).any()

@@ -328,6 +328,11 @@ class BombDefusal(World):
             symbols=symbols[..., None, :].expand(*live.shape, STAGES, TERMINALS),
         )
 
+    def nothing_new(self, observation: Observation) -> Tensor:
+        """Return the steps ``[T + 1]`` but the first of a stage, as bombs do not change within."""
+        stage = observation["ego"][:, 0]
+        return torch.cat([torch.zeros_like(stage[:1], dtype=torch.bool), stage[1:] == stage[:-1]])
+
     def next_observation(self, observation: Observation, action: Tensor) -> Observation:
         """Return the observation after an action ``[...]``; NaN for terminals of a new stage."""
         state = self.state_behind(observation)
