@@ -58,6 +58,7 @@ class HearingPerson(Person):
         self.ladder = (torch.randperm(own.number, generator=generator) + 0.5) / own.number
         self.ladder = self.ladder.to(own.device)
         super().__init__(_open(human), own.draws | self._drawn(self.log_hears))
+        self.cycle = own.cycle
 
     def in_round(self, past: RoundSoFar, seed: int = 0) -> Person:
         """Return the person in this round, with channels drawn given their actions so far."""

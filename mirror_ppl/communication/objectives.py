@@ -37,7 +37,8 @@ class Valued:
         utility: of each candidate under each posterior draw, in units of reward, ``[C, S]``.
         actions: predicted probabilities of actions at each step ahead, ``[C, H, A]``; ``None``
             where the objective does not predict actions.
-        worlds: number of draws W of the world; posterior draw s was valued in draw s mod W.
+        worlds: number of draws W of the world; posterior draw s was valued in draw s mod W. Or the
+            number of posterior draws that repeat, in the same way.
     """
 
     utility: Tensor
@@ -52,7 +53,8 @@ class Valued:
     def independent(self, gain: Tensor) -> Tensor:
         """Return gains ``[..., S]`` whose spread is that of a mean: those of draws, or means by W.
 
-        Posterior draws that were valued in one draw of the world share its chance.
+        Posterior draws that were valued in one draw of the world share its chance; those that are
+        the same differ in sampled actions alone.
         """
         draws = gain.shape[-1]
         if not 1 < self.worlds < draws:
@@ -164,7 +166,8 @@ class ExpectedUtility:
             steps = min(candidates.shape[1], horizon)
             cost = (channels.cost(candidates)[:, :steps] * discounts[:steps]).sum(1)
             utility -= cost[:, None]
-            return Valued(utility, torch.stack(predicted, 1), self.world.draws)
+            worlds = self.world.draws if self.world.draws > 1 else person.cycle
+            return Valued(utility, torch.stack(predicted, 1), worlds)
 
         return value
 
@@ -194,7 +197,7 @@ class ExpectedValue:
             probabilities = predicted_choices(context, message)
             utility = (probabilities * true_values).sum(-1).T
             predicted = probabilities.mean(0)[:, None]
-            return Valued(utility - channels.cost(message)[:, None], predicted)
+            return Valued(utility - channels.cost(message)[:, None], predicted, person.cycle)
 
         return value
 
@@ -256,7 +259,7 @@ class Divergence:
             assert state.scale is not None
             apart = self._apart(robot, Gaussian(state.mean, state.scale))[state.belief[index]]
             utility = -self.weight * apart[:, person.percept]
-            return Valued(utility - channels.cost(message)[:, None], None)
+            return Valued(utility - channels.cost(message)[:, None], None, person.cycle)
 
         return value
 

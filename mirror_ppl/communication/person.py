@@ -51,6 +51,7 @@ class Person:
         percepts: values ``[U, ...]`` of the sites that perception reads, each joint value in the
             draws once; in a round including attention.
         percept: index of each draw's combination, ``[S]``.
+        cycle: number D of draws that repeat: draw s is draw s mod D; 1 if they do not.
 
     Raises:
         HumanModelError: there are no draws, or their sites are not the model's.
@@ -70,6 +71,7 @@ class Person:
             with self._conditioned():
                 self.implants = human.prior()
             read = perceived_names(human)
+        self.cycle = _cycle(self.draws, self.number)
         self._perceived = {name: self.draws[name][:, 0, 0] for name in read}
         self.device = next(iter(self.draws.values())).device
         self.percepts, self.percept = self._distinct_percepts(self._perceived, self.number)
@@ -307,3 +309,17 @@ class PlanningContext:
         dearer = alone[places][:, None] >= third[places] - 1e-6  # of rounding
         mutual = dearer & dearer.T
         return (same & dearer & ~(mutual & torch.ones_like(mutual).triu())).any(1)
+
+
+def _cycle(draws: Mapping[str, Tensor], number: int) -> int:
+    """Number of draws after which they begin anew; 1 if they do not, or are all the same."""
+
+    def again(later: slice, earlier: slice) -> Tensor:
+        same = [(value[later] == value[earlier]).flatten(1).all(-1) for value in draws.values()]
+        return torch.stack(same).all(0)
+
+    begins = again(slice(1, None), slice(0, 1)).nonzero()
+    if not len(begins):
+        return 1
+    cycle = 1 + int(begins[0])
+    return cycle if again(slice(cycle, None), slice(0, number - cycle)).all() else 1

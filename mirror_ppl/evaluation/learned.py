@@ -19,10 +19,10 @@ from mirror_ppl.inference.results.summary import predictive
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.self_model import SelfModel
 
-SAME_DRAWS = 16
-"""Most draws to plan with where all are the same: they differ in noise alone, of which each has
-several realizations. To a network any message is informative, so that it has many candidates and
-planning with it takes longest."""
+NETWORK_DRAWS = 16
+"""Most draws to plan with, of networks that take turns: draws of one network differ in sampled
+actions alone. To a network any message is informative, so that it has many candidates and planning
+with it takes longest."""
 
 
 class Learned(Protocol):
@@ -89,7 +89,7 @@ class Trained:
             self.setting,
             self.world,
         )
-        return Person(human, human.draws(min(draws, SAME_DRAWS)))
+        return Person(human, human.draws(min(draws, NETWORK_DRAWS)))
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,15 @@ from example_person import (
     human,
     implants,
     person,
+    random_round,
     self_model,
     varied_draws,
 )
-from example_plans import ACTIONS
+from example_plans import ACTIONS, candidates_of
 
-from mirror_ppl.communication import Person
+from mirror_ppl.communication import ExpectedUtility, Person, SimulatorWorld
+from mirror_ppl.communication.decision import standard_error
+from mirror_ppl.communication.hearing import hearing
 from mirror_ppl.communication.person import PlanningContext
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.belief_tracking import BeliefState
@@ -138,3 +141,28 @@ def test_items_are_informative_where_a_person_does_not_know_them_yet():
     # Of a model that remembers more it is the same.
     sighted = person(1, Averaging(self_model()), front_own=two, front_other=two)
     assert torch.equal(PlanningContext.of(sighted, past).telling(allowed), left)
+
+
+def test_draws_that_repeat_are_no_further_evidence(generator):
+    """Their mean and its standard error are those of the draws that there are."""
+    draws = varied_draws(5, generator)
+    past, _ = random_round(2, generator)
+    candidates = candidates_of(past, generator, 2)
+    found = []
+    for order in (torch.arange(5), torch.arange(16) % 5, torch.arange(20) % 5):
+        someone = Person(human(), {name: value[order] for name, value in draws.items()})
+        assert someone.cycle == (1 if len(order) == 5 else 5)
+        assert hearing(someone, 0.9).cycle == someone.cycle
+        utility = ExpectedUtility(SimulatorWorld(DOMAIN), 3, enumerate_above=0.0)
+        valued = utility.at(PlanningContext.of(someone, past), 5, 0)(candidates)
+        gains = valued.utility - valued.utility[:1]
+        found.append((valued.mean, standard_error(valued, gains)))
+    for other in found[1:]:
+        torch.testing.assert_close(other, found[0], rtol=1e-3, atol=1e-5)
+
+
+def test_draws_that_are_alike_or_in_no_order_are_not_taken_for_repeated(generator):
+    draws = varied_draws(3, generator)
+    for order in ([0, 0, 0], [0, 1, 0, 2], [0, 1, 2, 0, 2], [1, 2]):
+        someone = Person(human(), {name: value[order] for name, value in draws.items()})
+        assert someone.cycle == 1

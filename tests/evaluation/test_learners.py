@@ -15,7 +15,7 @@ from mirror_ppl.domains.bomb_defusal.panel import OLD_RULES, RULES
 from mirror_ppl.errors import InputError
 from mirror_ppl.evaluation import learners
 from mirror_ppl.evaluation.known_sight import known_sight
-from mirror_ppl.evaluation.learned import SAME_DRAWS
+from mirror_ppl.evaluation.learned import NETWORK_DRAWS
 from mirror_ppl.evaluation.learners import TEST, Group, learn
 from mirror_ppl.evaluation.study import Prediction, predict
 from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer
@@ -197,8 +197,8 @@ def test_baselines_know_what_rewards_identify_of_the_world(monkeypatch):
     assert isinstance(person.human, NetworkPerson)
     assert person.human.networks.people == ("person-02",)
     assert person.number == 3
-    more = learn("bc", group, 1, 0).person(1, 64)  # pyright: ignore[reportAttributeAccessIssue]
-    assert more.number == SAME_DRAWS < 64
+    more = learn("bc", group, 1, 0, 3).person(1, 64)  # pyright: ignore[reportAttributeAccessIssue]
+    assert more.number == NETWORK_DRAWS < 64 and more.cycle == 3
     world = planning_domain(person.human, person.draws)
     assert world.rules == RULES  # pyright: ignore[reportAttributeAccessIssue]
     assert world.rules != OLD_RULES  # pyright: ignore[reportAttributeAccessIssue]
