@@ -32,6 +32,7 @@ from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, Observation
 from mirror_ppl.errors import InputError
 from mirror_ppl.models.world_knowledge import planning_domain
+from mirror_ppl.row_hashing import seed_of
 
 NOT_EXPLAINED = "the human model does not explain this person's actions"
 """The reason for silence to a person with the verdict ``unexplained`` of the model check."""
@@ -109,6 +110,8 @@ class Communicator:
         if not allowed.any():
             return self._silence(now, allowed)
         seed = self.seed * (domain.horizon + 1) + past.time
+        if domain.random:  # otherwise the same futures would be imagined in every round
+            seed = (seed + seed_of(past.observation)) % 2**62
         value = self.objective.at(context, steps_left, seed)
         found = self.search(value, allowed, seed)
         chosen = choose(found.valued, self.min_standard_errors)

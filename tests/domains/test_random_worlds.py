@@ -112,6 +112,25 @@ def test_chance_that_draws_share_counts_once_in_standard_errors(seed):
     assert abs(actual / claimed - 1) < 4 * (2 / 100 + 2 / 7 / 100) ** 0.5
 
 
+def test_each_round_has_imagined_futures_of_its_own():
+    """The same in a round that is planned again."""
+    toss = add_domain(Toss)
+    human, seeds = PerceptualOnly(SelfModel(toss, Sizes()).eval()), []
+
+    class Spy(ExpectedUtility):
+        def at(self, context, steps_left, seed):
+            seeds.append(seed)
+            return super().at(context, steps_left, seed)
+
+    values = {"sight_around": 0, "consistency": 5.0, "lapse": 0.01}
+    person = Person(human, {name: torch.full((9, 1, 1), value) for name, value in values.items()})
+    planner = Communicator(person, Spy(SimulatorWorld(toss), 1))
+    for bright in (0.0, 1.0, 1.0):
+        start = {"ego": torch.zeros(1, 1), "visual": torch.full((1, 1, 1), bright)}
+        planner.plan(RoundSoFar(start, [], {"visual": torch.zeros(0, 1, dtype=torch.bool)}))
+    assert seeds[0] != seeds[1] == seeds[2] and 0 <= min(seeds) <= max(seeds) < 2**62
+
+
 def test_the_oracle_of_a_random_world_has_a_draw_for_each_future():
     toss = add_domain(Toss)
     human = PerceptualOnly(SelfModel(toss, Sizes()).eval())
