@@ -175,12 +175,14 @@ def simulated_robot_like(
         reach.append(bins[drawn])
         consistency.append(CONSISTENCY_SPREAD * torch.randn((), generator=generator))
         noise.append(MOTOR_NOISE_SPREAD * torch.randn((), generator=generator))
+    device = next(self_model.parameters()).device
+    motor_noise = MOTOR_NOISE_MEDIAN * torch.stack(noise).exp()
     return RobotLike(
         self_model,
         setting,
-        torch.stack(reach) if population == "diverse" else None,
-        domain.record.consistency * torch.stack(consistency).exp(),
-        MOTOR_NOISE_MEDIAN * torch.stack(noise).exp() if domain.controls else None,
+        torch.stack(reach).to(device) if population == "diverse" else None,
+        (domain.record.consistency * torch.stack(consistency).exp()).to(device),
+        motor_noise.to(device) if domain.controls else None,
     )
 
 
