@@ -10,7 +10,7 @@ from matplotlib.patches import Patch
 
 from mirror_ppl.plots.implants import TITLES
 from mirror_ppl.plots.picture import Picture, label_of
-from mirror_ppl.plots.reading import BLACK, BLUE, GREY, ORANGE, PURPLE
+from mirror_ppl.plots.reading import BLACK, BLUE, GREY, ORANGE, PURPLE, TITLE
 
 if TYPE_CHECKING:
     import arviz as az
@@ -37,6 +37,7 @@ def plot_identifiability(data: az.InferenceData) -> Picture:
     Args:
         data: with the group ``identifiability``; of more than 60 people the first are drawn.
     """
+    everybody = len(data["identifiability"]["person"])
     group = data["identifiability"].isel(person=slice(MOST_PEOPLE))
     people = [str(person) for person in group["person"].values]
     scenarios = [str(name) for name in group["scenario"].values]
@@ -76,6 +77,8 @@ def plot_identifiability(data: az.InferenceData) -> Picture:
     figure.legend(
         handles=handles, loc="outside lower center", ncols=2 if scenarios else 1, frameon=False
     )
+    if len(people) < everybody:
+        figure.suptitle(f"The first {len(people)} of {everybody} people", **TITLE)
     return figure
 
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mirror_ppl.inference.results.checks import ONE_SIDED, REPLICATES, SHARE, tail
-from mirror_ppl.inference.results.criticism import FINE, LEVEL
+from mirror_ppl.inference.results.criticism import FINE, LEVEL, SUSPECT, UNEXPLAINED
 from mirror_ppl.plots.picture import Picture, label_of
-from mirror_ppl.plots.reading import BLACK, BLUE, ORANGE
+from mirror_ppl.plots.reading import BLACK, BLUE, ORANGE, TITLE
 
 if TYPE_CHECKING:
     import arviz as az
@@ -52,9 +52,11 @@ def plot_model_check(data: az.InferenceData) -> Picture:
     rounds, each predicted from the others: of the model and of the base rate.
 
     Args:
-        data: with the group ``model_check``; of more than 60 people the first are drawn.
+        data: with the group ``model_check``. Of more than 60 people 60 are drawn: those who are
+            unexplained, then those who are suspect, then the first of the others.
     """
-    group = data["model_check"].isel(person=slice(MOST_PEOPLE))
+    everybody = data["model_check"]
+    group = everybody.isel(person=_drawn(list(everybody["verdict"].values)))
     labels = [label_of(str(person)) for person in group["person"].values]
     labels = [
         label if verdict in FINE else f"{label} ({verdict})"
@@ -73,7 +75,19 @@ def plot_model_check(data: az.InferenceData) -> Picture:
     for ax in axes:
         ax.set_ylim(len(labels) - 0.5, -0.5)
         ax.spines[:].set_visible(False)
+    if len(labels) < len(everybody["person"]):
+        some = f"{len(labels)} of {len(everybody['person'])} people"
+        figure.suptitle(f"{some}: unexplained, then suspect ones first", **TITLE)
     return figure
+
+
+def _drawn(verdicts: list[str]) -> list[int]:
+    """Places of the people to draw, in order; where all fit, in that of the recordings."""
+    places = list(range(len(verdicts)))
+    if len(places) > MOST_PEOPLE:
+        rank = {UNEXPLAINED: 0, SUSPECT: 1}
+        places.sort(key=lambda place: rank.get(verdicts[place], len(rank)))
+    return places[:MOST_PEOPLE]
 
 
 def _p_values(ax, group: xr.Dataset) -> None:
