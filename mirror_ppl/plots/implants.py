@@ -117,7 +117,8 @@ def _bars(
     names: dict[int, str],
 ) -> None:
     """Draw probabilities of each value as bars; values are evenly spaced."""
-    values = np.union1d(before, after)
+    # The truth has a place of its own, also where no draw is equal to it.
+    values = np.unique([*before, *after, *([] if true is None else [true])])
     places = np.arange(len(values))
     for label, numbers, colour, shift in (
         ("prior", before, PRIOR, -0.2),
@@ -130,7 +131,7 @@ def _bars(
     ax.set_yticks([0, 0.5, 1])
     ax.set_ylabel("probability")
     if true is not None:
-        _mark(ax, float(np.interp(true, values, places)))
+        _mark(ax, float(np.searchsorted(values, true)))
 
 
 def _densities(ax: Axes, before: np.ndarray, after: np.ndarray, true: float | None) -> None:

@@ -46,6 +46,17 @@ def test_implants_are_drawn_beside_the_prior_with_the_truth_marked(data):
     draw(figure)
 
 
+def test_a_truth_beyond_all_draws_has_a_place_of_its_own(data):
+    for group in ("posterior", "prior"):
+        data[group]["sight_front_own"] = data[group]["sight_front_own"].clip(max=3)
+    data["constant_data"]["truth_sight_front_own"][:] = 12
+    figure = plot_implants(data, "anna")
+    (ax,) = (ax for ax in figure.axes if ax.get_title() == "sight ahead, own lane")
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["0", "1", "2", "3", "all"]
+    assert ax.lines[-1].get_xdata() == [4]
+    assert [bar.get_height() for bar in ax.containers[1]] == [0, 0, 0.75, 0.25, 0]
+
+
 def test_implants_of_other_models_are_drawn_too(data):
     for group in ("posterior", "prior"):
         shape = data[group]["lapse"].shape
