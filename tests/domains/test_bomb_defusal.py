@@ -10,6 +10,7 @@ import torch
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.bomb_defusal import BombDefusal, BombState
+from mirror_ppl.domains.bomb_defusal.drawing import AHEAD, GAP, LAMP, MARGIN, OVER
 from mirror_ppl.domains.bomb_defusal.panel import (
     BUTTONS,
     OLD_RULES,
@@ -182,6 +183,17 @@ def test_terminals_show_symbols_and_one_is_lit():
     picture = WORLD.render(bomb("A", "cross"))
     assert picture.dtype == np.uint8 and picture.ndim == 3
     assert (picture == (51, 255, 102)).all(-1).any()
+
+
+def test_lamps_do_not_say_that_a_press_was_right():
+    """A state holds how many stages are over, so its picture is the same after any press."""
+    begun = bomb("A", "cross")
+    right, wrong = (WORLD.render(play(begun, [press])[0][-1]) for press in (RED, GREEN))
+    assert np.array_equal(right, wrong)
+    lamps = right[-8, [GAP + number * (LAMP + MARGIN) for number in range(3)]].tolist()
+    assert lamps == [list(OVER), list(AHEAD), list(AHEAD)]
+    assert len(set(OVER)) == 1  # neither green, for right, nor red, for wrong
+    assert "white if over" in WORLD.picture_legend
 
 
 def test_panels_are_read_as_they_are_drawn(generator):

@@ -9,13 +9,16 @@ from mirror_ppl.domains.bomb_defusal.panel import PICTURE, STAGES, TERMINALS
 
 LEGEND = (
     "Above: terminals; the symbol of the lit one (green) and the type determine the right button. "
-    "Below: stages, green if solved, and the type, orange for A and blue for B"
+    "Below: stages, white if over (the press right or wrong), and the type, orange for A and blue "
+    "for B"
 )
 CELL, GAP = 6, 6
 """Pixels along a side of a terminal's pixels, and between terminals."""
 LAMP, BELOW, MARGIN = 10, 12, 4
 """Pixels of the width of a lamp of a stage, of the row of lamps, and between lamps."""
-PANEL, SOLVED, UNSOLVED = (170, 170, 170), (60, 160, 60), (40, 40, 40)
+PANEL, OVER, AHEAD = (170, 170, 170), (245, 245, 245), (40, 40, 40)
+"""Colours of the panel and of lamps. That of a stage that is over is neither green nor red: a state
+does not hold whether the press was right."""
 TYPES = ((220, 120, 40), (60, 120, 220))
 """Colours of the types A and B."""
 
@@ -25,7 +28,7 @@ def draw_panel(pixels: Tensor, stage: int, kind: int) -> np.ndarray:
 
     Args:
         pixels: of the terminals, ``[6, 75]``.
-        stage: number of solved stages.
+        stage: number of stages that are over.
         kind: 0 for Type A, 1 for Type B.
     """
     side, columns = PICTURE[0] * CELL, TERMINALS // 2
@@ -39,6 +42,6 @@ def draw_panel(pixels: Tensor, stage: int, kind: int) -> np.ndarray:
     lamps = slice(-BELOW, -MARGIN)
     for number in range(STAGES):
         left = GAP + number * (LAMP + MARGIN)
-        picture[lamps, left : left + LAMP] = SOLVED if number < stage else UNSOLVED
+        picture[lamps, left : left + LAMP] = OVER if number < stage else AHEAD
     picture[lamps, -GAP - 2 * LAMP : -GAP] = TYPES[kind]
     return picture
