@@ -289,7 +289,7 @@ def test_frames_show_road_and_mind_of_each_round():
     assert headlines(figure)[::2] == [
         "step 0:  silence, then they stay",
         "step 1:  said rear-left, then they stay",
-        "step 3 (collision):  the end",
+        "step 3 (collision):  now",
     ]
     assert [title in texts(figure.axes[column]) for column, title in enumerate(("one", "two"))]
     # Axes go row by row: roads of both rounds, minds of both, and so on.
@@ -342,6 +342,13 @@ def test_two_cars_in_a_cell_are_drawn_above_each_other():
     assert thought.get_height() < 0.5
 
 
+@pytest.mark.parametrize(("steps", "last"), [(14, "now"), (15, "the end")])
+def test_only_the_end_of_a_round_is_called_so(steps, last):
+    """A round of driving has 15 steps."""
+    past = a_round(*[None] * steps)
+    assert headlines(plot_frames(person(), {"one": past}, [steps])) == [f"step {steps}:  {last}"]
+
+
 def stars(ax):
     return sum(line.get_marker() == (9, 1, 0) for line in ax.lines)
 
@@ -354,7 +361,7 @@ def test_a_collision_is_marked():
     figure = plot_frames(person(), {"one": past}, [0, 1])
     assert headlines(figure) == [
         "step 0:  silence, then they stay",
-        "step 1 (collision):  the end",
+        "step 1 (collision):  now",
     ]
     assert [stars(ax) for ax in figure.axes[:4]] == [0, 0, 1, 0]
 

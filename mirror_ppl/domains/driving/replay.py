@@ -217,7 +217,8 @@ def _headline(domain: Domain, past: RoundSoFar, step: int) -> str:
     """Return the title of a moment, such as "step 3:  said rear-left, then they switch"."""
     when = f"step {step}" + (" (collision)" if _collided(domain, past, step) else "")
     if step == past.time:
-        return f"{when}:  the end"
+        # A round that was cut at this step goes on.
+        return f"{when}:  {'the end' if step == domain.horizon else 'now'}"
     channels = Channels(domain)
     flags = channels.join({name: mask[step] for name, mask in past.told.items()})
     action = domain.actions[int(past.actions[step])]
