@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
@@ -13,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from mirror_ppl.plots.picture import Picture
-from mirror_ppl.plots.reading import BLACK, BLUE, GREY, ORANGE, PURPLE
+from mirror_ppl.plots.reading import BLACK, BLUE, GREY, ORANGE, PURPLE, edged
 
 PLACE = ["domain", "setting", "population"]
 """Columns that identify a place: domain, setting and population."""
@@ -58,8 +59,14 @@ NO_ROUNDS = 0.4
 """Position of 0 rounds on the logarithmic scale."""
 WIDTH, HEIGHT, LEGEND = 4.6, 3.8, 1.7
 """Inches: of a panel, and of the legend."""
+HALO = 2.0
+"""Points of the white line below that of an interval, of which a bar has to be left to see."""
 ACROSS = 3
 """Panels beside each other."""
+CHARACTERS = 14
+"""Characters of a note on an inch of a picture's width."""
+TOGETHER = {"all": "all modalities"}
+"""Label of the modality that has the name of a model."""
 
 
 class Look(NamedTuple):
@@ -91,11 +98,12 @@ def plot_curves(
         by_ratio: True for a logarithmic scale, which resolves values near the floor.
     """
     figure, panels = _panels(means)
-    looks = _looks(means["model"])
+    looks, banded = _looks(means["model"]), False
     for ax, (place, here) in zip(panels, _by_place(means), strict=True):
         far = _far(here)
         for model, own in here.drop(far.index).groupby("model", sort=False):
             _curve(ax, own.sort_values("rounds"), looks[str(model)])
+        banded |= bool(np.isfinite(here.loc[~_is_level(here), "low"].to_numpy()).any())
         for number, (model, mean) in enumerate(zip(far["model"], far["mean"], strict=True)):
             text = f"{looks[model].label}: {mean:.1f}, off the scale"
             ax.text(0.02, 0.02 + 0.06 * number, text, transform=ax.transAxes, fontsize=8)
@@ -111,6 +119,12 @@ def plot_curves(
         _title(ax, place)
     _name_measure(panels, label)
     _legend(figure, panels)
+    if banded:
+        _note(
+            figure,
+            "Bands: 90% interval of each mean over people. They may overlap although one model is "
+            "better in most people; the study's tables compare models person by person.",
+        )
     return figure
 
 
@@ -175,15 +189,22 @@ def _curve(ax: Axes, own: pd.DataFrame, look: Look) -> None:
 def plot_relevance(shares: pd.DataFrame) -> Picture:
     """Draw the share of relevant messages after all rounds, one panel per place.
 
+    Lines are 90% intervals. Models that learned from fewer rounds than others at that place are not
+    drawn, but named below.
+
     Args:
         shares: columns as of `plot_curves` and ``modality``; NaN where nothing was communicated.
     """
     figure, panels = _panels(shares)
-    looks = _looks(shares["model"])
+    looks, left_out = _looks(shares["model"]), []
     for ax, (place, here) in zip(panels, _by_place(shares), strict=True):
         # Rules have no rounds; what learned is shown once, after the most rounds of all.
         own = here.groupby("model")["rounds"].transform("max")
-        last = here.loc[(here["rounds"] == own) & own.isin([0, here["rounds"].max()])]
+        shown = own.isin([0, here["rounds"].max()])
+        last = here.loc[(here["rounds"] == own) & shown]
+        where = f" in {', '.join(place)}" if len(panels) > 1 else ""
+        for model, number in here.loc[~shown].groupby("model", sort=False)["rounds"].max().items():
+            left_out.append(f"{looks[str(model)].label} ({number}){where}")
         models, names = (list(dict.fromkeys(last[name])) for name in ("model", "modality"))
         width = 0.8 / len(models)
         for one in last.to_dict("records"):
@@ -197,14 +218,28 @@ def plot_relevance(shares: pd.DataFrame) -> Picture:
             # The pattern distinguishes models of one colour.
             look = {"color": colour, "hatch": HATCHES[line], "edgecolor": "white", "lw": 0}
             ax.bar(x, 100 * one["mean"], 0.9 * width, label=label, **look)
-            ax.plot([x, x], [100 * one["low"], 100 * one["high"]], color=BLACK, lw=1)
-        ax.set_xticks(range(len(names)), names)
+            # On a white line, so that it is seen on black bars.
+            interval = {"color": BLACK, "lw": 1, "path_effects": edged(HALO)}
+            ax.plot([x, x], [100 * one["low"], 100 * one["high"]], **interval)
+        ax.set_xticks(range(len(names)), [TOGETHER.get(str(name), str(name)) for name in names])
         ax.set_xlim(-0.5, len(names) - 0.5)
         ax.set_ylim(0, 105)
         _title(ax, place)
     _name_measure(panels, "relevant, % of the communicated items")
     _legend(figure, panels)
+    known = np.isfinite(shares["low"].to_numpy()).any()
+    notes = ["Lines: 90% intervals over people."] if known else []
+    if left_out:
+        notes.append(f"Not drawn, as they learned from fewer rounds: {'; '.join(left_out)}.")
+    if notes:
+        _note(figure, " ".join(notes))
     return figure
+
+
+def _note(figure: Figure, text: str) -> None:
+    """Write what marks mean below all panels."""
+    lines = textwrap.fill(text, int(CHARACTERS * figure.get_figwidth()), break_on_hyphens=False)
+    figure.supxlabel(lines, x=0.01, ha="left", fontsize=9)
 
 
 def _title(ax: Axes, place: Place) -> None:

@@ -48,6 +48,7 @@ def test_pictures_show_truth_probability_and_samples(tmp_path):
     assert everything[4, 1].sum() > 0
     assert [figure.axes[n].get_xlabel() for n in (3, 5)] == ["1.5 cells", "2 cells"]
     assert truth[7, 1].sum() > 0 and truth[4, 1].sum() == 0
+    assert "from black, 0, to white, 1" in figure.get_supxlabel()
     figure.save(tmp_path / "sight.png")
     assert (tmp_path / "sight.png").read_bytes().startswith(b"\x89PNG")
 

@@ -93,4 +93,7 @@ def test_predictive_check_draws(data):
     observed = [line for line in left.lines if line.get_label() == "observed"][0]
     assert observed.get_xdata().tolist() == [1.5, 5 / 3]
     assert switching(data, "ben").shape == (B, T)
+    said = figure.get_supxlabel()
+    assert "bars are 90% intervals" in said and "ticks their medians" in said
+    assert "vertical lines their 90% intervals" in " ".join(said.split())
     draw(figure)

@@ -13,6 +13,7 @@ from mirror_ppl.evaluation.study_summary import (
     means_table,
     shares_table,
 )
+from mirror_ppl.plots.reading import BLACK
 from mirror_ppl.plots.study import STYLES, plot_curves, plot_relevance
 
 
@@ -115,3 +116,51 @@ def test_bars_are_of_the_most_rounds_and_silence_is_named():
     (bar,) = ax.patches
     assert bar.get_height() == pytest.approx(60)  # pyright: ignore[reportAttributeAccessIssue]
     assert [text.get_text() for text in ax.texts] == ["none: no messages"]
+
+
+def note(figure):
+    """What stands below all panels."""
+    return " ".join(figure.get_supxlabel().split())
+
+
+def test_bands_are_named_where_there_are_any():
+    figure = plot_curves(means_table([result("mirror", 1, 0.2), result("none", 0, 0.1)]), "NLL")
+    assert note(figure).startswith("Bands: 90% interval of each mean over people.")
+    nothing = Interval(0.2, float("nan"), float("nan"))  # of one person
+    one = ModelResult(Place("driving", "fog", "paper"), "mirror", 1, nothing, 1, None)
+    for results in ([one], [result("none", 0, 0.1)]):
+        assert not note(plot_curves(means_table(results), "NLL"))
+
+
+def test_models_that_learned_from_fewer_rounds_are_named():
+    place, share = Place("driving", "fog", "paper"), Interval(0.6, 0.5, 0.7)
+    shares = [
+        Share(place, "mirror", 20, "all", 5, share),
+        Share(place, "bc", 1, "all", 5, share),
+        Share(place, "bc", 5, "all", 5, share),
+    ]
+    figure = plot_relevance(shares_table(shares))
+    assert note(figure) == (
+        "Lines: 90% intervals over people. Not drawn, as they learned from fewer rounds: bc (5)."
+    )
+    assert len(figure.axes[0].patches) == 1
+    there = [*shares[1:], Share(Place("driving", "clear", "paper"), "mirror", 20, "all", 5, share)]
+    figure = plot_relevance(shares_table([*there, shares[0]]))
+    assert note(figure).endswith("fewer rounds: bc (5) in driving, fog, paper.")
+    assert note(plot_relevance(shares_table(shares[:1]))) == "Lines: 90% intervals over people."
+
+
+def test_intervals_are_seen_on_black_bars_and_modalities_are_no_models():
+    place = Place("driving", "fog", "paper")
+    shares = [
+        Share(place, model, 0, name, 5, Interval(0.6, 0.5, 0.7))
+        for model in ("oracle", "all")
+        for name in ("all", "visual")
+    ]
+    (ax,) = plot_relevance(shares_table(shares)).axes
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["all modalities", "visual"]
+    assert len(ax.lines) == 4
+    for line in ax.lines:
+        assert line.get_color() == BLACK
+        (below, _) = line.get_path_effects()
+        assert below._gc["foreground"] == "white" and below._gc["linewidth"] > line.get_linewidth()

@@ -38,6 +38,12 @@ RANGES = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 LANE_NAMES = ("left lane", "right lane")
 LEVELS = (0.05, 0.5, 0.95)
 """Quantiles of drawn intervals: the median and the ends of 90%."""
+EXPLANATION = (
+    "Left: bars are 90% intervals of predictions, and ticks their medians. Right: points are the "
+    "observed shares at steps of similar predicted probability,\nand vertical lines their 90% "
+    "intervals; calibrated predictions lie on the dotted line."
+)
+"""What the marks of a predictive check mean."""
 
 
 def plot_round(
@@ -159,7 +165,7 @@ def plot_predictive_check(data: az.InferenceData) -> Picture:
         data: with ``observed_data``, ``posterior_predictive`` and ``prior_predictive``.
     """
     everybody = people(data)
-    figure = Picture(figsize=(11, max(3.6, 0.3 * len(everybody) + 1.6)), layout="constrained")
+    figure = Picture(figsize=(11, max(4, 0.3 * len(everybody) + 2)), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     place = np.arange(len(everybody))
     for label, group, colour, shift in (
@@ -187,6 +193,7 @@ def plot_predictive_check(data: az.InferenceData) -> Picture:
     figure.legend(
         *left.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False
     )
+    figure.supxlabel(EXPLANATION, x=0.01, ha="left", fontsize=9)
     return figure
 
 

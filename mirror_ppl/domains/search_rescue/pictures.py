@@ -71,7 +71,7 @@ def sight_picture(data: az.InferenceData) -> Picture:
     known = [truth(data, SITE, person) is not None for person in shown]
     columns = ["all there is", *(["what they see"] if any(known) else []), "probability"]
     columns += [f"sample {number}" for number in range(1, SAMPLES + 1)]
-    size = (1.75 * len(columns) + 0.6, 1.8 * len(shown) + 1.5)
+    size = (1.75 * len(columns) + 0.6, 1.8 * len(shown) + 1.65)
     figure = Picture(figsize=size, layout="constrained")
     grid = figure.subplots(len(shown), len(columns), squeeze=False)
     for row, person in zip(grid, shown, strict=True):
@@ -97,7 +97,8 @@ def sight_picture(data: az.InferenceData) -> Picture:
         "What each person sees of the house",
         len(shown),
         "Black: not seen. Blue: the firefighter, by the left corridor. Green: the victim.\n"
-        "Purple: the obstacle. Yellow: the entrance. Below: how far they see.",
+        "Purple: the obstacle. Yellow: the entrance. Below: how far they see.\n"
+        "Probability that they see a cell: from black, 0, to white, 1.",
     )
     return figure
 
