@@ -31,7 +31,7 @@ from mirror_ppl.evaluation.tables import Rows, page
 
 DOCS = Path(__file__).parents[1] / "docs"
 RESULTS = DOCS / "results"
-WORDS, WHOLE = ("domain", "setting", "population", "person", "model"), ("seed", "rounds")
+WORDS, WHOLE = ("domain", "setting", "population", "person", "model"), ("seed", "rounds", "played")
 """Columns that are no numbers, and that are whole ones."""
 EVERYTHING = "anything"
 """Notion of relevance of worlds in which all items are relevant, so that there is no page of it."""

@@ -128,9 +128,10 @@ class Assistance:
 def assist(cell: Assistance) -> Rows:
     """Measure returns and messages: a row for each person and communicator.
 
-    Additional columns: means per round of ``task``, ``cost``, ``net`` and ``mishaps``; totals of
-    ``items`` of each modality, and of those that were relevant by each notion. The rounds are the
-    same for all communicators, and were not learned from.
+    Additional columns: ``played``, the number of rounds with messages; means per round of ``task``,
+    ``cost``, ``net`` and ``mishaps``; totals over these rounds of ``items`` of each modality, and
+    of those that were relevant by each notion. The rounds are the same for all communicators, and
+    were not learned from.
     """
     group, learned = cell.group, None
     if cell.model not in REFERENCES:
@@ -154,6 +155,7 @@ def assist(cell: Assistance) -> Rows:
             rows.append(
                 _row(group, who, cell.rounds, person_id(number))
                 | {
+                    "played": cell.played,
                     "task": sum(played.task) / cell.played,
                     "cost": sum(played.cost) / cell.played,
                     "net": float(played.net.mean()),

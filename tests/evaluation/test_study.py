@@ -29,6 +29,8 @@ def test_messages_are_counted_and_paid_for():
     assert [row["person"] for row in rows] == ["person-01", "person-02"]
     for row in rows:
         assert row["net"] == pytest.approx(row["task"] - row["cost"])
+        # Items are totals over the two rounds, whose number the row has.
+        assert row["played"] == 2
         # More than one car in each of 30 steps, shown and said.
         assert row["items_visual"] > 30 and row["items_verbal"] > 30
         for notion in ("collision_course", "closing"):

@@ -27,6 +27,7 @@ from benchmarks.reach import ROWS, table
 from benchmarks.sight_scale import ROWS as SCALES
 from benchmarks.tables import DOCS, RESULTS, results_page, rows_of, studies, study_page
 from mirror_ppl.evaluation.study_summary import interval, ways_to_oracle
+from mirror_ppl.evaluation.tables import comma_separated
 from mirror_ppl.inference.calibration.ranks import Calibration
 
 STUDIES = studies()
@@ -36,6 +37,17 @@ STUDIES = studies()
 def test_pages_are_what_their_rows_say(name):
     assert (RESULTS / f"{name}.md").read_text() == study_page(name, STUDIES[name])
     assert (RESULTS / f"{name}.png").stat().st_size > 0
+
+
+def test_pages_are_the_same_of_rows_with_the_number_of_played_rounds(tmp_path):
+    """Which rows that were kept before do not have."""
+    for name in ("driving_assistance", "driving_relevance"):
+        with_number = [row | {"played": 2} for row in STUDIES[name]]
+        assert study_page(name, with_number) == study_page(name, STUDIES[name])
+    file = tmp_path / "rows.csv"
+    file.write_text(comma_separated(with_number))
+    assert {row["played"] for row in rows_of(file)} == {2}
+    assert rows_of(file) == with_number
 
 
 def test_tables_of_the_page_of_results_are_what_their_rows_say():
