@@ -63,6 +63,10 @@ HALO = 2.0
 """Points of the white line below that of an interval, of which a bar has to be left to see."""
 ACROSS = 3
 """Panels beside each other."""
+BANDS, LINES = "bands", "lines"
+"""What intervals are drawn as."""
+BESIDE = 1.05
+"""Ratio of the places of two models with one number of rounds, so that their lines are apart."""
 CHARACTERS = 14
 """Characters of a note on an inch of a picture's width."""
 TOGETHER = {"all": "all modalities"}
@@ -86,6 +90,8 @@ def plot_curves(
 ) -> Picture:
     """Draw a measure against the number of rounds, one panel per place; bands are 90% intervals.
 
+    The interval of a model with one number of rounds is drawn as a vertical line.
+
     A model that learns nothing and is so far from all others that these could not be distinguished
     is named in words.
 
@@ -98,12 +104,12 @@ def plot_curves(
         by_ratio: True for a logarithmic scale, which resolves values near the floor.
     """
     figure, panels = _panels(means)
-    looks, banded = _looks(means["model"]), False
+    looks, marks = _looks(means["model"]), set()
     for ax, (place, here) in zip(panels, _by_place(means), strict=True):
-        far = _far(here)
+        far, single = _far(here), 0
         for model, own in here.drop(far.index).groupby("model", sort=False):
-            _curve(ax, own.sort_values("rounds"), looks[str(model)])
-        banded |= bool(np.isfinite(here.loc[~_is_level(here), "low"].to_numpy()).any())
+            marks.add(_curve(ax, own.sort_values("rounds"), looks[str(model)], single))
+            single += len(own) == 1 and own["rounds"].item() > 0
         for number, (model, mean) in enumerate(zip(far["model"], far["mean"], strict=True)):
             text = f"{looks[model].label}: {mean:.1f}, off the scale"
             ax.text(0.02, 0.02 + 0.06 * number, text, transform=ax.transAxes, fontsize=8)
@@ -111,6 +117,9 @@ def plot_curves(
             ax.axhline(floor[place], color=BLACK, lw=1, ls=":", label="people's own entropy")
         ticks = sorted({*here.loc[~_is_level(here), "rounds"]})
         ax.set_xscale("log")
+        if len(ticks) == 1:
+            only = max(ticks[0], NO_ROUNDS)
+            ax.set_xlim(only / 2, 2 * only * BESIDE**single)
         ax.set_xticks([max(number, NO_ROUNDS) for number in ticks], [str(one) for one in ticks])
         ax.minorticks_off()
         if by_ratio:
@@ -119,11 +128,12 @@ def plot_curves(
         _title(ax, place)
     _name_measure(panels, label)
     _legend(figure, panels)
-    if banded:
+    drawn = " and ".join(sorted(marks - {""}))
+    if drawn:
         _note(
             figure,
-            "Bands: 90% interval of each mean over people. They may overlap although one model is "
-            "better in most people; the study's tables compare models person by person.",
+            f"{drawn.capitalize()}: 90% intervals of means over people. They may overlap although "
+            "one model is better in most people; tables compare person by person.",
         )
     return figure
 
@@ -175,15 +185,32 @@ def _logarithmic(ax: Axes) -> None:
     ax.yaxis.set_major_formatter("{x:g}")
 
 
-def _curve(ax: Axes, own: pd.DataFrame, look: Look) -> None:
+def _curve(ax: Axes, own: pd.DataFrame, look: Look, single: int) -> str:
+    """Draw a model, and return what its intervals are drawn as; "" if there are none.
+
+    Args:
+        ax: the panel.
+        own: rows of the model, by number of rounds.
+        look: its label and style.
+        single: number of models before it with one number of rounds, beside which it is drawn.
+    """
     label, colour, line, mark = look
     rounds, mean = own["rounds"].to_numpy(), own["mean"].to_numpy()
     if rounds[-1] == 0:
         ax.axhline(mean[0], color=colour, ls=line, lw=1.2, label=label)
-        return
-    place = np.maximum(rounds, NO_ROUNDS)
+        return ""
+    place, known = np.maximum(rounds, NO_ROUNDS), bool(np.isfinite(own["low"].to_numpy()).any())
+    alone = len(place) == 1
+    if alone:
+        place = place * BESIDE**single
     ax.plot(place, mean, color=colour, ls=line, marker=mark, ms=5, label=label)
+    if not known:
+        return ""
+    if alone:  # a band of one point would be invisible
+        ax.vlines(place, own["low"], own["high"], color=colour, lw=1.2)
+        return LINES
     ax.fill_between(place, own["low"], own["high"], color=colour, alpha=0.12, lw=0)
+    return BANDS
 
 
 def plot_relevance(shares: pd.DataFrame) -> Picture:

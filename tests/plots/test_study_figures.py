@@ -1,5 +1,6 @@
 """Figures of studies: curves by rounds, their levels, and bars of messages."""
 
+import numpy as np
 import pytest
 
 from mirror_ppl.evaluation.assistance import REFERENCES
@@ -124,8 +125,17 @@ def note(figure):
 
 
 def test_bands_are_named_where_there_are_any():
-    figure = plot_curves(means_table([result("mirror", 1, 0.2), result("none", 0, 0.1)]), "NLL")
-    assert note(figure).startswith("Bands: 90% interval of each mean over people.")
+    results = [result("mirror", 1, 0.2), result("mirror", 5, 0.3), result("none", 0, 0.1)]
+    figure = plot_curves(means_table(results), "NLL")
+    assert note(figure).startswith("Bands: 90% intervals of means over people.")
+    # A band of a single number of rounds could not be seen, and is a line.
+    single = [result("bc", 5, 0.4), result("sqil", 5, 0.4)]
+    figure = plot_curves(means_table([*results, *single]), "NLL")
+    assert note(figure).startswith("Bands and lines: 90% intervals of means over people.")
+    _, first, second = figure.axes[0].collections
+    np.testing.assert_allclose(first.get_segments(), [[[5, 0.3], [5, 0.5]]])
+    (((place, _), _),) = second.get_segments()  # beside it
+    assert 5 < place < 6
     nothing = Interval(0.2, float("nan"), float("nan"))  # of one person
     one = ModelResult(Place("driving", "fog", "paper"), "mirror", 1, nothing, 1, None)
     for results in ([one], [result("none", 0, 0.1)]):

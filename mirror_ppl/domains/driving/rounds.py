@@ -41,7 +41,7 @@ LEVELS = (0.05, 0.5, 0.95)
 EXPLANATION = (
     "Left: bars are 90% intervals of predictions, and ticks their medians. Right: points are the "
     "observed shares at steps of similar predicted probability,\nand vertical lines their 90% "
-    "intervals; calibrated predictions lie on the dotted line."
+    "intervals; points of calibrated predictions lie near the dotted line."
 )
 """What the marks of a predictive check mean."""
 
