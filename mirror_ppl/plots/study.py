@@ -264,8 +264,9 @@ def plot_relevance(shares: pd.DataFrame) -> Picture:
 
 
 def _note(figure: Figure, text: str) -> None:
-    """Write what marks mean below all panels."""
-    lines = textwrap.fill(text, int(CHARACTERS * figure.get_figwidth()), break_on_hyphens=False)
+    """Write what marks mean below all panels, beside a legend that may be long."""
+    width = int(CHARACTERS * (figure.get_figwidth() - LEGEND))
+    lines = textwrap.fill(text, width, break_on_hyphens=False)
     figure.supxlabel(lines, x=0.01, ha="left", fontsize=9)
 
 

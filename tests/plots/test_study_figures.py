@@ -174,3 +174,11 @@ def test_intervals_are_seen_on_black_bars_and_modalities_are_no_models():
         assert line.get_color() == BLACK
         (below, _) = line.get_path_effects()
         assert below._gc["foreground"] == "white" and below._gc["linewidth"] > line.get_linewidth()
+
+
+def test_a_note_is_not_below_a_long_legend():
+    results = [result(name, 1, 0.2) for name in [*LEARNERS][:17]]
+    figure = plot_curves(means_table(results), "NLL")
+    figure.canvas.draw()
+    text, (legend,) = figure._supxlabel, figure.legends
+    assert text.get_window_extent().x1 < legend.get_window_extent().x0
