@@ -274,7 +274,8 @@ class Demonstrations:
                 those that they have. People who have none of them stay, with no rounds.
 
         Raises:
-            DemonstrationsError: a number is negative, beyond all people's rounds, or no number.
+            DemonstrationsError: a number is negative, beyond all people's rounds or named twice, or
+                is no number.
         """
         counts = self.round_counts.tolist()
         if isinstance(rounds, slice):
@@ -283,6 +284,9 @@ class Demonstrations:
         else:
             numbers = listed(rounds, "rounds", "numbers, or a slice", DemonstrationsError)
             numbers = [_in_range("round", number, max(counts)) for number in numbers]
+            # A round that is selected twice would count as twice the evidence.
+            if repeated := [number for number in numbers if numbers.count(number) > 1]:
+                raise DemonstrationsError(f"round {repeated[0]} is selected more than once")
             kept = [[number for number in numbers if number < count] for count in counts]
         most = max(1, *map(len, kept))
         index = torch.tensor([row + [0] * (most - len(row)) for row in kept])

@@ -170,6 +170,7 @@ NOT_ROUNDS = {
     "half a round": ([0.5], "the number of a round must be a whole number, not 0.5"),
     "a mask": ([True, False, True], "the number of a round must be a whole number, not True"),
     "half a slice": (slice(0.5), "rounds must be a slice of whole numbers, not slice(None, 0.5"),
+    "a round twice": ([1, 0, 1, 0], "round 1 is selected more than once"),
     "a slice of no step": (slice(None, None, 0), "not slice(None, None, 0) (slice step cannot be"),
 }
 
