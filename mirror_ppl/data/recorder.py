@@ -132,7 +132,8 @@ class Recorder(gym.Wrapper):
             )
         now.add(number, control, self._told, sum(terms.values()), seen)
         self._told = []
-        truncated = truncated or len(now.actions) == self.world.horizon
+        at_horizon = len(now.actions) == self.world.horizon
+        truncated = truncated or (at_horizon and not terminated)
         now.over = terminated or truncated
         return found, float(reward), terminated, truncated, info
 

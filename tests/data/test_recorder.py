@@ -150,6 +150,17 @@ def test_rounds_do_not_go_on_where_the_world_has_ended():
         env.step(1)
 
 
+def test_a_task_that_is_done_at_the_horizon_is_not_truncated():
+    way = add_domain(Way)
+    env = Recorder(way.make(), way)
+    for place, steps in ((7, [(True, False)]), (6, [(False, True)])):
+        env.reset(seed=next(seed for seed in range(99) if _place(way, seed) == place))
+        ends = [env.step(action)[2:4] for action in (0, 0, 0, 1, 1, 1)]
+        assert ends == [(False, False)] * (way.horizon - 1) + steps
+        with pytest.raises(InputError, match="call reset"):
+            env.step(1)
+
+
 class Ends(Way):
     """As many ends as the environment has."""
 
