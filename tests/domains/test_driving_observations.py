@@ -137,6 +137,20 @@ def test_who_assumes_cars_to_come_closer_supposes_it_of_those_seen_once(domain, 
     assert torch.equal(supposed.speed[~unsure], start.speed[~unsure])
 
 
+@pytest.mark.parametrize(
+    ("position", "speed", "possible"),
+    [(11, 1.0, True), (-3, -1.0, True), (12, 0.0, True), (-12, 0.0, True)]
+    + [(11, 0.0, False), (0, 0.0, False), (12, 1.0, False), (3, 0.5, False), (3, 2.0, False)],
+)
+def test_cars_have_a_speed_as_long_as_they_are_on_the_road(domain, position, speed, possible):
+    observed = domain.observe(state(1, (position, 12, -11, -17), speed=(-1, 1, 1, -1)))
+    verbal = observed["verbal"].clone()
+    verbal[0, 2] = speed
+    broken = [name for name, now in domain.faults({**observed, "verbal": verbal}).items() if now]
+    rule = "relative_speed has to be -1 or 1, and 0 of cars 12 cells away"
+    assert broken == [rule] * (not possible)
+
+
 def test_symbols_that_depend_on_other_items_are_a_fault(domain):
     assert faults_of(domain) == []
 

@@ -231,8 +231,8 @@ class Driving(World):
             "verbal position has to be the visual one": (
                 observation["verbal"][..., :2] != visual
             ).any((-1, -2)),
-            "relative_speed has to be -1, 0 or 1": (
-                observation["verbal"][..., 2] != observation["verbal"][..., 2].round().clamp(-1, 1)
+            f"relative_speed has to be -1 or 1, and 0 of cars {ROAD_END} cells away": (
+                observation["verbal"][..., 2].abs() != (ahead.abs() < ROAD_END).to(ahead)
             ).any(-1),
         }
 

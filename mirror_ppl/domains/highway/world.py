@@ -62,7 +62,7 @@ from mirror_ppl.domains.highway import estimate, expert, reward, scenarios, traf
 from mirror_ppl.domains.highway.estimate import state_with
 from mirror_ppl.domains.highway.knowledge import Memory, imagined, nothing, out_of_sight, remember
 from mirror_ppl.domains.highway.lidar import RANGE, SECTOR, SECTORS, scan
-from mirror_ppl.domains.highway.limits import outside, require_action
+from mirror_ppl.domains.highway.limits import impossible, outside, require_action
 from mirror_ppl.domains.highway.manoeuvres import MANOEUVRES, REFLECTED, controls, deed
 from mirror_ppl.domains.highway.messages import GROUPS, SEEN, SPOKEN, group_of
 from mirror_ppl.domains.highway.record import RECORD
@@ -223,7 +223,8 @@ class Highway(World):
     def faults(self, observation: Observation) -> dict[str, Tensor]:
         """Return which observations ``[...]`` break each rule of recordings, by rule."""
         names = {"ego": self.ego_features} | {m.name: m.features for m in self.modalities}
-        return super().faults(observation) | outside(observation, names)
+        found = super().faults(observation) | outside(observation, names)
+        return found | impossible(observation)
 
     def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
         """Return the direction of sight and the distance in metres of each sector ``[..., 36]``."""

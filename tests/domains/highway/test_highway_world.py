@@ -12,7 +12,7 @@ from mirror_ppl.domains.highway import DirectHighway, Highway
 from mirror_ppl.domains.highway.lidar import RANGE, SECTORS
 from mirror_ppl.domains.highway.pictures import ACROSS, BEHIND, CAR, EGO, SCALE, UNSEEN
 from mirror_ppl.domains.highway.road import OTHERS
-from mirror_ppl.domains.highway.speech import DIRECTIONS
+from mirror_ppl.domains.highway.speech import DIRECTIONS, NOTHING
 from mirror_ppl.errors import InputError, UnknownNameError
 
 WORLD = DirectHighway()
@@ -119,7 +119,59 @@ def test_what_cannot_be_observed_is_named(generator, modality, place, value, rul
     now[modality] = now[modality].clone()
     now[modality][2, ..., place] = value
     broken = {name: where.tolist() for name, where in WORLD.faults(now).items() if where.any()}
-    assert broken == {rule: [False, False, True, False]}
+    assert broken[rule] == [False, False, True, False]
+
+
+def broken_by(now):
+    return " ".join(rule for rule, where in WORLD.faults(now).items() if bool(where))
+
+
+def test_empty_sectors_have_no_velocity():
+    now = WORLD.observe(state_of(cars=[(30.0, 4.0, 0.0, 8.0)]))
+    assert broken_by(now) == ""
+    visual = now["visual"].clone()
+    visual[9, 1] = -2.0  # to the right, where the road ends much nearer
+    assert broken_by({**now, "visual": visual}) == (
+        "a sector with nothing within 60 m has to have the velocity 0"
+    )
+    # A car whose near end is a centimetre within the range: measured at 60 m, with its velocity.
+    edge = WORLD.observe(state_of(cars=[(62.49, 4.0, 0.0, 8.0)]))
+    assert edge["visual"][0].tolist() == [RANGE, -2.0, 0.0]
+    assert broken_by(edge) == ""
+
+
+@pytest.mark.parametrize(
+    ("car", "direction", "certain"),
+    [
+        ((10.0, 4.0, 0.0, 8.0), "front", True),
+        ((-10.0, 4.0, 0.0, 8.0), "rear", True),
+        ((8.0, 8.0, 0.0, 12.0), "front-right", True),
+        ((40.0, 4.0, 0.0, 8.0), "front", False),  # a sector is wider than a lane there
+        ((8.0, 6.0, 0.0, 8.0), "front", False),  # between two lanes
+        ((0.5, 8.0, 0.0, 10.0), "front-right", False),  # or a bit behind
+    ],
+)
+def test_nothing_is_not_said_of_a_direction_with_a_car(car, direction, certain):
+    beside = [(30.0, 0.0, 0.0, 9.0), (30.0, 8.0, 0.0, 9.0)] if direction == "front" else []
+    now = WORLD.observe(state_of(cars=[car, *beside]))
+    assert broken_by(now) == ""
+    verbal = now["verbal"].clone()
+    assert verbal[DIRECTIONS.index(direction), 0] != NOTHING
+    verbal[DIRECTIONS.index(direction)] = NOTHING
+    rule = "a direction in which the lidar sees a car must not have the sentence that nothing is"
+    assert (rule in broken_by({**now, "verbal": verbal})) == certain
+    if direction == "front":  # a car must be somewhere ahead, if in no direction for certain
+        verbal[[DIRECTIONS.index(side) for side in ("front-left", "front-right")]] = NOTHING
+        assert rule in broken_by({**now, "verbal": verbal})
+
+
+def test_rounds_never_break_the_rules_of_observations(generator):
+    now = WORLD.initial(200, generator)
+    for _ in range(30):
+        broken = {name for name, where in WORLD.faults(WORLD.observe(now)).items() if where.any()}
+        assert broken == set()
+        action = torch.rand(200, 2, generator=generator) * 2 - 1
+        now = WORLD.transition(now, action * torch.tensor([0.2, 1.0]))
 
 
 @pytest.mark.parametrize(
