@@ -1,12 +1,13 @@
 """Checks that recordings are possible in their domain's world.
 
 Rounds are at most as long as the world's, each observation has to be possible, and the action
-recorded at step t has to lead from the observation at time t to the one at time t + 1.
+recorded at step t has to lead from the observation at time t to the one at time t + 1. In worlds in
+which recorded rewards enter inference, each reward has to be possible, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -61,15 +62,16 @@ def check_world(demonstrations: Demonstrations, allowed: float = 0.0) -> Contrad
         The number of steps that do.
 
     Raises:
-        DemonstrationsError: a round is too long or goes on when the task is done, an observation is
-            impossible, or too many steps contradict each other; the message says where the first
-            is, what was expected and what was found.
+        DemonstrationsError: a round is too long or goes on when the task is done, an observation or
+            a reward is impossible, or too many steps contradict each other; the message says where
+            the first is, what was expected and what was found.
     """
-    wrong = []
+    wrong, unearned = [], []
     for person in range(demonstrations.num_people):  # one by one, to bound memory
         observation = _observation(demonstrations, person)
         _check_observations(demonstrations, person, observation)
         wrong.append(_wrong(demonstrations, person, observation))
+        unearned.append(_unearned(demonstrations, person, observation))
     found = Contradictions(
         dict(zip(demonstrations.people, demonstrations.mask.sum((1, 2)).tolist(), strict=True)),
         dict(zip(demonstrations.people, [int(steps.sum()) for steps in wrong], strict=True)),
@@ -78,7 +80,11 @@ def check_world(demonstrations: Demonstrations, allowed: float = 0.0) -> Contrad
         number, steps = sum(found.contradicting.values()), sum(found.steps.values())
         message = f"{_first(demonstrations, wrong)}; {number} of {steps} steps "
         message += f"({found.share:.1%}) contradict the next observation, {100 * allowed:.3g}% may"
-        raise DemonstrationsError(message + _shifted(demonstrations, wrong))
+        raise DemonstrationsError(message + _shifted(demonstrations, wrong, _wrong, "action"))
+    # After the dynamics: shifted actions have wrong rewards, too, and are what to report.
+    if any(bool(steps.any()) for steps in unearned):
+        message = _first_reward(demonstrations, unearned)
+        raise DemonstrationsError(message + _shifted(demonstrations, unearned, _unearned, "reward"))
     return found
 
 
@@ -156,6 +162,32 @@ def _wrong(
     return torch.stack(differs).any(0) & mask
 
 
+def _unearned(
+    demonstrations: Demonstrations, person: int, observation: Observation, shift: int = 0
+) -> Tensor:
+    """Steps ``[B, T]`` of a person with a recorded reward that the world cannot give.
+
+    With a shift, the reward that many steps before is tested instead, where there is one.
+    """
+    mask = demonstrations.mask[person]
+    possible = _possible_rewards(demonstrations, person, observation)
+    if possible is None or demonstrations.rewards is None:
+        return torch.zeros_like(mask)
+    rewards = demonstrations.rewards[person]
+    if shift:
+        rewards, mask = torch.roll(rewards, shift, 1), mask & _has_neighbour(mask, shift)
+    return _differs(possible, rewards[..., None]).all(-1) & mask
+
+
+def _possible_rewards(
+    demonstrations: Demonstrations, person: int, observation: Observation
+) -> Tensor | None:
+    """Rewards ``[B, T, R]`` that a person's steps may have, or None if any may occur."""
+    now = {name: value[:, :-1] for name, value in observation.items()}
+    actions = _executed(demonstrations, person)
+    return get_domain(demonstrations.domain).possible_rewards(now, actions)
+
+
 def _executed(demonstrations: Demonstrations, person: int) -> Tensor:
     """Executed controls ``[B, T, C]``, if recorded, or actions ``[B, T]``; padding is action 0."""
     actions = demonstrations.actions[person].clamp(min=0)
@@ -202,21 +234,50 @@ def _first(demonstrations: Demonstrations, wrong: Sequence[Tensor]) -> str:
     raise AssertionError("nothing contradicts at this step")
 
 
-def _shifted(demonstrations: Demonstrations, wrong: Sequence[Tensor]) -> str:
-    """Describe a shift if most wrong steps would fit with the action one step before or after."""
+def _first_reward(demonstrations: Demonstrations, unearned: Sequence[Tensor]) -> str:
+    """Describe the first reward that the world cannot give."""
+    person = next(place for place, steps in enumerate(unearned) if steps.any())
+    number, step = unearned[person].nonzero()[0].tolist()
+    possible = _possible_rewards(demonstrations, person, _observation(demonstrations, person))
+    assert possible is not None and demonstrations.rewards is not None
+    expected = " or ".join(f"{each:g}" for each in possible[number, step].unique().tolist())
+    action = int(demonstrations.actions[person, number, step])
+    total, steps = sum(int(each.sum()) for each in unearned), int(demonstrations.mask.sum())
+    return (
+        f"person {demonstrations.people[person]!r}, round {number}, step {step}: the reward of "
+        f"action {action} ({get_domain(demonstrations.domain).actions[action]}) is expected to be "
+        f"{expected}, found {demonstrations.rewards[person, number, step].item():g}; {total} of "
+        f"{steps} steps have impossible rewards"
+    )
+
+
+def _shifted(
+    demonstrations: Demonstrations,
+    wrong: Sequence[Tensor],
+    test: Callable[[Demonstrations, int, Observation, int], Tensor],
+    what: str,
+) -> str:
+    """Describe a shift if most wrong steps would fit with what is one step before or after.
+
+    Args:
+        demonstrations: rounds of P people.
+        wrong: by person, the steps ``[B, T]`` that fail the test.
+        test: `_wrong` or `_unearned`.
+        what: the name of what is tested.
+    """
     number = sum(int(steps.sum()) for steps in wrong)
     if number < ENOUGH_STEPS:
         return ""
     for shift, word in ((1, "before"), (-1, "after")):
         left = fitting = 0
         for person, steps in enumerate(wrong):
-            still = _wrong(demonstrations, person, _observation(demonstrations, person), shift)
+            still = test(demonstrations, person, _observation(demonstrations, person), shift)
             own = steps & _has_neighbour(demonstrations.mask[person], shift)
             left += int(still.sum())
             fitting += int((own & ~still).sum())
         if fitting > number / 2 and left < number / 2:
             return (
-                f"; {fitting} of them fit with the action of the step {word}: the actions look "
+                f"; {fitting} of them fit with the {what} of the step {word}: the {what}s look "
                 "shifted by one step"
             )
     return ""

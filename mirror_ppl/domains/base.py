@@ -364,6 +364,15 @@ class Domain(Protocol):
         """
         ...
 
+    def possible_rewards(self, observation: Observation, action: Tensor) -> Tensor | None:
+        """Return the rewards ``[..., R]`` that recordings may have, or None if any may occur.
+
+        Args:
+            observation: the full observation ``[..., K, F]`` before the action.
+            action: ``[...]``.
+        """
+        ...
+
     def nearest(self, observation: Observation) -> Observation:
         """Return the possible observation ``[...]`` nearest to a decoded one."""
         ...

@@ -316,6 +316,13 @@ class World(ABC):
             return {name: torch.full_like(part, math.nan) for name, part in observation.items()}
         return self.observe(self.transition(self.state_behind(observation), action))
 
+    def possible_rewards(self, observation: Observation, action: Tensor) -> Tensor | None:
+        """Return the rewards ``[..., R]`` that recordings may have: None, which is any.
+
+        Worlds in which recorded rewards enter inference define it.
+        """
+        del observation, action
+
     def nearest(self, observation: Observation) -> Observation:
         """Return the possible observation nearest to a decoded one: features rounded to levels."""
 

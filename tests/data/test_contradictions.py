@@ -235,6 +235,47 @@ def test_a_round_on_the_highway_ends_with_an_accident():
     assert text in refused(replace(rounds, ego=ego))
 
 
+def with_rewards(rounds, rewards):
+    return replace(rounds, rewards=torch.where(rounds.mask, rewards, torch.nan))
+
+
+@pytest.mark.parametrize(
+    ("presses", "reward", "expected"),
+    [(True, -1.0, "-6 or 4"), (True, 5.0, "-6 or 4"), (False, 0.0, "-1"), (False, 4.0, "-1")],
+)
+def test_rewards_that_bomb_defusal_cannot_give_are_refused(presses, reward, expected):
+    rounds = recorded("bomb_defusal_labelled_paper")
+    fitting = rounds.mask[1] & ((rounds.actions[1] > 0) == presses)
+    number, step = fitting.nonzero()[0].tolist()
+    action = int(rounds.actions[1, number, step])
+    rewards = rounds.rewards.clone()
+    rewards[1, number, step] += 5e-4  # a rounding error
+    check_world(with_rewards(rounds, rewards), 0.0)
+    rewards[1, number, step] = reward
+    assert refused(with_rewards(rounds, rewards), 1.0) == (
+        f"person {rounds.people[1]!r}, round {number}, step {step}: the reward of action {action} "
+        f"({get_domain('bomb_defusal').actions[action]}) is expected to be {expected}, found "
+        f"{reward:g}; 1 of {int(rounds.mask.sum())} steps have impossible rewards"
+    )
+
+
+@pytest.mark.parametrize(("by", "word"), [(1, "after"), (-1, "before")])
+def test_rewards_shifted_by_a_step_are_recognized(by, word):
+    rounds = recorded("bomb_defusal_unlabelled_diverse")
+    shifted = torch.roll(rounds.rewards.nan_to_num(-1.0), by, -1)
+    message = refused(with_rewards(rounds, shifted))
+    assert message.endswith(
+        f"fit with the reward of the step {word}: the rewards look shifted by one step"
+    )
+
+
+def test_rewards_of_a_laboratory_are_accepted_where_inference_does_not_read_them():
+    rounds = recorded("driving_fog_paper")
+    assert check_world(with_rewards(rounds, torch.full(rounds.actions.shape, 7.0))).share == 0
+    bomb = replace(recorded("bomb_defusal_labelled_paper"), rewards=None)
+    assert check_world(bomb).share == 0
+
+
 def test_a_share_of_contradictions_may_be_allowed():
     rounds = noisy()
     assert int(rounds.mask.sum()) == 150

@@ -342,6 +342,17 @@ class BombDefusal(World):
         visual = expected["visual"].masked_fill(new[..., None, None], torch.nan)
         return {**expected, "visual": visual}
 
+    def possible_rewards(self, observation: Observation, action: Tensor) -> Tensor:
+        """Return the rewards ``[..., 2]`` of a right and a wrong press, or twice that of waiting.
+
+        Recorded rewards decide which rules are inferred, so that either press is possible.
+        """
+        del observation
+        right, wrong = (
+            torch.where(action == WAIT, TIME, TIME + outcome) for outcome in (RIGHT, WRONG)
+        )
+        return torch.stack([right, wrong], -1)
+
     def nearest(self, observation: Observation) -> Observation:
         """Return the possible observation nearest to decoded values."""
         stage, since = observation["ego"].round().unbind(-1)
