@@ -17,6 +17,7 @@ How CARLA's world becomes a state
       count as straight. CARLA's y points to the right too, so nothing is mirrored.
     - Lanes have any width there; across the road metres are stretched to 4 m a lane.
     - Vehicles count as 5 m by 2 m. The nearest eight are in the state; missing ones are far away.
+      Vehicles beside the three lanes and their shoulders, as oncoming traffic, are left out.
     - What others intend is not known: their intended speed is the one they have, and nobody has a
       scripted event. A planner that uses such states foresees less than with highway-env.
     - Acceleration in [-1, 1] is throttle or brake, which is not the same as m/s2.
@@ -35,11 +36,15 @@ from mirror_ppl.domains.highway.lidar import RANGE
 from mirror_ppl.domains.highway.road import (
     LANE_WIDTH,
     LANES,
+    LEFT_EDGE,
     LIMIT,
     MAX_STEERING,
     OTHERS,
+    RIGHT_EDGE,
+    SHOULDER,
     TICK,
     TICKS,
+    WIDTH,
     lane_of,
     wrapped,
 )
@@ -51,6 +56,12 @@ Spawn = Callable[[Any, str, int], Any]
 """Places vehicles, given client, scenario's name and seed; returns the ego's actor."""
 AWAY = 10 * RANGE
 """Metres ahead at which missing vehicles are."""
+LEFTMOST = LEFT_EDGE - SHOULDER + WIDTH / 2
+RIGHTMOST = RIGHT_EDGE + SHOULDER - WIDTH / 2
+"""``y`` in metres between which vehicles are on the road or its shoulders, with their whole width.
+
+The next lane beyond a shoulder has its centre a metre further out.
+"""
 
 
 class CarlaEnv(RoundEnv):
@@ -81,14 +92,13 @@ class CarlaEnv(RoundEnv):
         self._carla, self._client, self._spawn = carla, client, spawn
         self._ego: Any = None
         self._sensor: Any = None
+        self._synchronous = False
 
     def begin(self, scenario: int, seed: int) -> None:
         """Let ``spawn`` place vehicles, with physics at 20 Hz that waits for us."""
-        self.close()
+        self._remove_sensor()
+        self._wait(True)
         world = self._client.get_world()
-        settings = world.get_settings()
-        settings.synchronous_mode, settings.fixed_delta_seconds = True, TICK
-        world.apply_settings(settings)
         self._ego = self._spawn(self._client, self.domain.scenarios[scenario], seed)
         blueprint = world.get_blueprint_library().find("sensor.other.collision")
         transform = self._carla.Transform()
@@ -121,6 +131,9 @@ class CarlaEnv(RoundEnv):
         others = [a for a in world.get_actors().filter("vehicle.*") if a.id != self._ego.id]
         lane = world.get_map().get_waypoint(self._ego.get_location())
         rows = torch.tensor([_row(actor, lane) for actor in (self._ego, *others)])
+        on_road = (rows[:, 1] >= LEFTMOST) & (rows[:, 1] <= RIGHTMOST)
+        on_road[0] = True  # the ego may have left the road
+        rows = rows[on_road]
         order = rows[1:, 0].hypot(rows[1:, 1] - rows[0, 1]).argsort()[:OTHERS]
         rows = torch.cat([rows[:1], rows[1:][order]])
         missing = OTHERS + 1 - len(rows)
@@ -151,7 +164,21 @@ class CarlaEnv(RoundEnv):
         )
 
     def close(self) -> None:
-        """Remove the collision sensor; vehicles are those of ``spawn``."""
+        """Remove the collision sensor and let the server run by itself; vehicles stay."""
+        self._remove_sensor()
+        if self._synchronous:
+            self._wait(False)
+
+    def _wait(self, waits: bool) -> None:
+        """Set whether the server waits for our ticks, of 1/20 s, or runs by itself."""
+        world = self._client.get_world()
+        settings = world.get_settings()
+        settings.synchronous_mode = waits
+        settings.fixed_delta_seconds = TICK if waits else None
+        world.apply_settings(settings)
+        self._synchronous = waits
+
+    def _remove_sensor(self) -> None:
         if self._sensor is not None:
             self._sensor.stop()
             self._sensor.destroy()

@@ -195,6 +195,10 @@ def test_a_collision_ends_the_round_and_the_next_one_begins_anew():
     assert len(world.sensors) == 1 and not env.state.crashed
     env.close()
     assert not world.sensors
+    assert not world.settings.synchronous_mode and world.settings.fixed_delta_seconds is None
+    world.settings = Some(synchronous_mode=True)  # by another client
+    env.close()
+    assert world.settings.synchronous_mode
 
 
 def test_only_the_nearest_vehicles_are_in_the_state():
@@ -203,3 +207,13 @@ def test_only_the_nearest_vehicles_are_in_the_state():
     env.reset(seed=0)
     ahead = sorted(env.state.x[1:].tolist())
     assert ahead == pytest.approx([15.0 * k - 0.05 for k in range(1, OTHERS + 1)], abs=1e-3)
+
+
+def test_only_vehicles_on_the_road_are_in_the_state():
+    aside = [(3.0 * k, place, -9.0) for k, place in enumerate((-1.0, -1.1, 3.0, 4.0, -2.0) * 2)]
+    road = [(40.0, 0.0, 9.0), (45.0, 2.6, 9.0), (50.0, -0.6, 9.0)]  # the last on the shoulders
+    env, _, _ = made(cars=[*aside, *road])
+    env.reset(seed=0)
+    there = env.state.x[1:] < 500
+    assert env.state.y[1:][there].tolist() == pytest.approx([0.0, 10.4, -2.4], abs=1e-4)
+    assert env.state.lane[1:][there].tolist() == [0, 2, 0]
