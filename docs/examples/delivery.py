@@ -75,6 +75,6 @@ class Delivery(SteppedWorld):
         return bool(np.hypot(*env.pad) < NEAR)
 
     def visibility(self, setting, observation):
-        """In fog what is within 2 metres."""
+        """In fog what is at most 2 metres ahead or behind, and at most 2 to the side."""
         _, distance = self.distance(observation)
         return {"visual": (distance <= 2) | (setting == "clear")}

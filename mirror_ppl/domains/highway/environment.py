@@ -55,7 +55,9 @@ class HighwayEnv(RoundEnv):
     `mirror_ppl.domains.highway.HighwayState`; after a step also the `rewards`, terms by name.
 
     ## Rewards
-    The sum of the terms of `mirror_ppl.domains.highway.reward`.
+    The sum of the terms of `mirror_ppl.domains.highway.reward`, for each action of 0.2 s. A
+    manoeuvre has the same terms for 0.5 s, so that here an accident (-100) weighs 2.5 times less
+    relative to what is earned per second.
 
     ## Starting State
     The domain's `initial`: a random scenario unless one is given.
