@@ -15,6 +15,8 @@ from mirror_ppl.training.views import ASSUMPTION_PROBABILITY, KIND_PROBABILITIES
 
 OF_CHOICES = ("choice_weight", "regret_weight")
 """Weights of losses of choices."""
+WEIGHTS = ("world_weight", "speech_weight", "difference_weight", "bin_weight", "ranked_weight")
+"""Weights of other losses."""
 
 
 @dataclass(frozen=True)
@@ -120,12 +122,10 @@ class SelfModelOptions:
         for name in ("phases", "rounds", "steps", "batch", "stride"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if not 0 < self.learning_rate <= 1:
-            raise InputError(
-                f"learning_rate must be above 0 and at most 1, not {self.learning_rate}"
-            )
-        weights = ("difference_weight", "bin_weight", "ranked_weight", *OF_CHOICES)
-        for name in (*weights, "regret_margin"):
+        for name in ("learning_rate", "target_rate"):
+            if not 0 < getattr(self, name) <= 1:
+                raise InputError(f"{name} must be above 0 and at most 1, not {getattr(self, name)}")
+        for name in (*WEIGHTS, *OF_CHOICES, "regret_margin"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be at least 0 and finite, not {getattr(self, name)}")
         if self.window < 0 or self.length < 0:

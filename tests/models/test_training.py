@@ -414,6 +414,10 @@ def test_checkpoint_of_another_run_is_refused(tmp_path):
     [
         ("phases", 0, "phases must be at least 1, not 0"),
         ("ranked_weight", -1.0, "ranked_weight must be at least 0 and finite, not -1.0"),
+        ("world_weight", -1.0, "world_weight must be at least 0 and finite, not -1.0"),
+        ("speech_weight", -3.0, "speech_weight must be at least 0 and finite, not -3.0"),
+        ("target_rate", 0.0, "target_rate must be above 0 and at most 1, not 0.0"),
+        ("target_rate", 7, "target_rate must be above 0 and at most 1, not 7"),
         ("bin_weight", math.nan, "bin_weight must be at least 0 and finite, not nan"),
         ("batch", -1, "batch must be at least 1, not -1"),
         ("epsilon", 1.5, r"epsilon must lie in \[0, 1\], not 1.5"),
