@@ -226,7 +226,7 @@ class HumanModel(nn.Module):
         """
         del step
         direction, distance = self.domain.distance(observation)
-        reach = implant_priors.reach(self.domain, implants)  # [..., D]
+        reach = implant_priors.sight_limits(self.domain, implants)  # [..., D]
         batch = broadcast_shapes(reach.shape[:-1], direction.shape[:-1])
         own = reach.expand(*batch, -1).gather(-1, direction.expand(*batch, -1))
         return by_eye(self.domain, distance <= own)

@@ -7,7 +7,7 @@ decide. Each is a sample site of the human model, with one value per person.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import pyro
 import pyro.distributions as dist
@@ -238,8 +238,21 @@ def residual_implants(domain: Domain, latent: int, like: Tensor) -> dict[str, Te
 
 def reach(domain: Domain, implants: Mapping[str, Tensor]) -> Tensor:
     """Return sight thresholds ``[..., D]`` in the domain's unit of distance."""
+    return _looked_up(domain, implants, domain.reach_bins)
+
+
+def sight_limits(domain: Domain, implants: Mapping[str, Tensor]) -> Tensor:
+    """Return the distances ``[..., D]`` up to which people see: infinite for the last threshold.
+
+    The last threshold is everything, also where rare distances exceed it.
+    """
+    return _looked_up(domain, implants, (*domain.reach_bins[:-1], math.inf))
+
+
+def _looked_up(domain: Domain, implants: Mapping[str, Tensor], values: Sequence[float]) -> Tensor:
+    """Return the value ``[..., D]`` of each direction's bin."""
     sites = [implants[site] for site in sight_sites(domain)]
-    bins = torch.tensor(domain.reach_bins, device=sites[0].device)
+    bins = torch.tensor(values, device=sites[0].device)
     # Stacking in front copies whole blocks; a hundred thousand combinations are looked up.
     index = torch.stack(torch.broadcast_tensors(*sites))
     return bins.index_select(0, index.flatten()).view(index.shape).movedim(0, -1)

@@ -91,7 +91,9 @@ class RobotLike(SimulatedPeople):
             return self.domain.visibility(self.setting, observation)
         direction, distance = self.domain.distance(observation)
         people = torch.arange(len(self.reach)).view(-1, *(1,) * (distance.dim() - 1))
-        return by_eye(self.domain, distance <= self.reach[people, direction])
+        everything = self.reach >= torch.tensor(self.domain.reach_bins[-1:]).to(self.reach)
+        limits = self.reach.masked_fill(everything, torch.inf)
+        return by_eye(self.domain, distance <= limits[people, direction])
 
     @torch.no_grad()
     def step(

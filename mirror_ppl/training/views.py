@@ -40,7 +40,8 @@ class ViewPlan:
     """Views of B rounds; a plan can be applied to any course of a round.
 
     Attributes:
-        reach: sight threshold for each direction ``[B, D]``, in the domain's unit of distance.
+        reach: sight threshold for each direction ``[B, D]``, in the domain's unit of distance; the
+            last of the domain's ``reach_bins`` is everything.
         keep: for each modality, the probability ``[B]`` that an item within reach is visible.
         told: for each modality, the probability ``[B]`` that a communicable item is communicated.
         remembers: ``[B]``, True if what follows from earlier observations counts as visible.
@@ -66,7 +67,9 @@ class ViewPlan:
             for name, value in observation.items()
             if name != "ego"
         }
-        seen["visual"] = distance <= self.reach[batch, direction]
+        everything = self.reach >= torch.tensor(domain.reach_bins[-1:]).to(self.reach)
+        limits = self.reach.masked_fill(everything, torch.inf)
+        seen["visual"] = distance <= limits[batch, direction]
         steps = slice(first, first + stride * distance.shape[1], stride)
         return {
             name: near & (self.noise[name][:, steps, :, 0] < self.keep[name][:, None, None])
