@@ -39,6 +39,7 @@ CAPABILITIES = (
         "controls", "numbered actions", "continuous actions, and how precisely they are set"
     ),
     Capability("over", "rounds last to the horizon", "rounds that end"),
+    Capability("possible_rewards", "any rewards", "recordings with other rewards are refused"),
     Capability("learn", "what was last seen", "memory: what people know without looking"),
     Capability("assume", "nothing", "what people take for granted"),
     Capability("communicable", "everything", "items that can be communicated"),

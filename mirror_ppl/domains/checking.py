@@ -10,7 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import map_state
+from mirror_ppl.domains.base import map_state, total_reward
+from mirror_ppl.domains.checking_attributes import faults_of_attributes
 from mirror_ppl.domains.world import World, offers
 from mirror_ppl.errors import DomainError
 from mirror_ppl.randomness import forked
@@ -19,6 +20,8 @@ from mirror_ppl.user_code import describe
 ROUNDS = 6
 """Number of rounds that a check plays."""
 TOLERANCE = 1e-4
+REWARD_TOLERANCE = 1e-3
+"""That of recorded rewards."""
 
 
 def require_sound(world: World) -> World:
@@ -39,7 +42,7 @@ def faults_of(world: World) -> list[str]:
 
     Plays rounds of random actions; checks stop at the first stage with faults.
     """
-    faults: list[str] = _of_names(world)
+    faults: list[str] = faults_of_attributes(world)
     if faults:
         return faults
     try:
@@ -66,36 +69,6 @@ def _call(world: World, name: str, *arguments: Any) -> Any:
         raise _CallError(f"{name} fails: {describe(error)}") from error
 
 
-def _of_names(world: World) -> list[str]:
-    found = []
-    if len(world.actions) < 2:  # noqa: PLR2004 - one action is no choice
-        found.append(f"actions: expected at least 2, found {len(world.actions)}")
-    if not world.ego_features:
-        found.append("ego_features: expected at least one, found none")
-    if not (isinstance(world.horizon, int) and world.horizon > 0):
-        found.append(f"horizon: expected a whole number above 0, found {world.horizon!r}")
-    if list(world.reach_bins) != sorted(set(world.reach_bins)):
-        found.append(f"reach_bins: expected growing numbers, found {world.reach_bins}")
-    for name in ("actions", "settings", "reward_terms"):
-        names = getattr(world, name)
-        if isinstance(names, str) or len(set(names)) < len(names) or not names:
-            found.append(f"{name}: expected a tuple of different names, found {names!r}")
-    known = {*world.ego_features, *(name for m in world.modalities for name in m.features)}
-    for name, levels in world.levels.items():
-        if name not in known:
-            found.append(f"levels: {name} is no feature; there are {', '.join(sorted(known))}")
-        elif not isinstance(levels, range) or not levels:
-            found.append(f"levels: {name} has to have a range that is not empty, found {levels!r}")
-    if len(world.directions) > 1 and not offers(world, "distance"):
-        found.append(
-            f"distance: there are {len(world.directions)} directions, of which the default gives "
-            "the first to all items; define it"
-        )
-    if world.mishap[0] not in world.reward_terms:
-        found.append(f"mishap: expected one of reward_terms, found {world.mishap[0]!r}")
-    return found
-
-
 def _begins(world: World) -> list[str]:
     """Check initial states: dataclasses of tensors, determined by the seed."""
     first = _start(world)
@@ -114,7 +87,24 @@ def _begins(world: World) -> list[str]:
     _call(world, "initial", ROUNDS, torch.Generator().manual_seed(0), scenario)
     if not _same(first, _start(world)):
         return ["initial: equal generators give different states; draw with the one that is passed"]
-    return []
+    return _faults_of_scenarios(world)
+
+
+def _faults_of_scenarios(world: World) -> list[str]:
+    """Return the fault of several scenarios that all give the same states."""
+    first = None
+    for number in range(len(world.scenarios)):
+        scenario = torch.full((ROUNDS,), number)
+        state = _call(world, "initial", ROUNDS, torch.Generator().manual_seed(0), scenario)
+        if first is not None and not _same(first, state):
+            return []
+        first = state
+    if len(world.scenarios) == 1:
+        return []
+    return [
+        f"initial: all {len(world.scenarios)} scenarios begin in the same states; use the argument "
+        "scenario, self.scenario(batch, generator, scenario) where it is None"
+    ]
 
 
 def _start(world: World) -> Any:
@@ -237,6 +227,8 @@ def _looks(world: World) -> list[str]:
         values = _call(world, "reference_values", along, 0.9)
         wanted = (*shape, len(world.actions))
         found.append(_fault("reference_values", "", values, wanted, float))
+    if offers(world, "possible_rewards"):
+        found.append(_fault_of_rewards(world, along, torch.stack(actions, 1), observation))
     if offers(world, "reflected"):
         found += _faults_of_reflection(world, along, observation)
     return [fault for fault in found if fault] or _of_one(world, along, observation)
@@ -275,6 +267,31 @@ def _fault_of_chance(world: World, states: Any, observation: Mapping[str, Tensor
         if not torch.equal(value, observation[name]):
             return f"redrawn: changes {name}, expected states that look alike"
     return "redrawn: returns the same states, expected other seeds" * _same(states, others)
+
+
+def _fault_of_rewards(
+    world: World, states: Any, actions: Tensor, observation: Mapping[str, Tensor]
+) -> str:
+    """Return the fault of `World.possible_rewards`: they have to hold those of `rewards`."""
+    now = {name: part[:, :-1] for name, part in observation.items()}
+    possible = _call(world, "possible_rewards", now, actions)
+    if possible is None:
+        return ""
+    shape = (*actions.shape, possible.shape[-1] if getattr(possible, "ndim", 0) else 1)
+    if fault := _fault("possible_rewards", "", possible, shape, float):
+        return fault
+    before, after = (
+        map_state(lambda part, at=at: part[:, at], states)
+        for at in (slice(None, -1), slice(1, None))
+    )
+    earned = total_reward(_call(world, "rewards", before, actions, after))
+    missing = ((possible - earned[..., None]).abs() > REWARD_TOLERANCE).all(-1)
+    missing = missing & ~_call(world, "over", before)
+    if not bool(missing.any()):
+        return ""
+    place = tuple(missing.nonzero()[0].tolist())
+    listed = ", ".join(f"{each:g}" for each in possible[place].tolist())
+    return f"possible_rewards: expected {earned[place].item():g} among them, found {listed}"
 
 
 def _faults_of_reflection(
