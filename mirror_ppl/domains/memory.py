@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Modality, Observation, Visibility
+from mirror_ppl.domains.base import Observation, Visibility
+from mirror_ppl.domains.modality import Modality
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.base import Observation, Visibility, require_known
 from mirror_ppl.domains.controls import Control, grid
 from mirror_ppl.domains.derived import VISUAL, complete
 from mirror_ppl.domains.memory import LastSeen
+from mirror_ppl.domains.modality import Modality
 from mirror_ppl.domains.record import Record
 from mirror_ppl.errors import DomainError
 

@@ -16,7 +16,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor, nn
 
-from mirror_ppl.domains.base import Modality
+from mirror_ppl.domains.modality import Modality
 from mirror_ppl.errors import AssetError
 from mirror_ppl.randomness import forked, seed_everything
 

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 from torch.nn.functional import conv2d, conv_transpose2d
 
-from mirror_ppl.domains.base import Modality
+from mirror_ppl.domains.modality import Modality
 from mirror_ppl.domains.search_rescue import SearchRescue
 from mirror_ppl.errors import AssetError, UnknownNameError
 from mirror_ppl.models import speech

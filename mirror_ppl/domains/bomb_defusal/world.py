@@ -52,7 +52,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.base import Observation, Visibility, require_known
 from mirror_ppl.domains.bomb_defusal.drawing import LEGEND, draw_panel
 from mirror_ppl.domains.bomb_defusal.knowledge import BombKnowledge
 from mirror_ppl.domains.bomb_defusal.panel import (
@@ -70,6 +70,7 @@ from mirror_ppl.domains.bomb_defusal.panel import (
     right_button,
 )
 from mirror_ppl.domains.bomb_defusal.record import RECORD
+from mirror_ppl.domains.modality import Modality
 from mirror_ppl.domains.world import World
 
 RIGHT, WRONG, TIME = 5.0, -5.0, -1.0

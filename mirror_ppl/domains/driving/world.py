@@ -51,7 +51,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.base import Observation, Visibility, require_known
 from mirror_ppl.domains.driving.cars import (
     CAR_LANES,
     CAR_SIDES,
@@ -74,6 +74,7 @@ from mirror_ppl.domains.driving.rewards import (
     PROXIMITY,
     known_car_values,
 )
+from mirror_ppl.domains.modality import Modality
 from mirror_ppl.domains.world import World
 
 STAY, SWITCH = 0, 1

@@ -8,9 +8,9 @@ Table I of the supplement, which has no row for CARLA: showing *n* groups at a d
 
 from __future__ import annotations
 
-from mirror_ppl.domains.base import Modality
 from mirror_ppl.domains.highway.lidar import FEATURES, RANGE, SECTORS, UNITS
 from mirror_ppl.domains.highway.speech import DIRECTIONS, NOTHING, UTTERANCES
+from mirror_ppl.domains.modality import Modality
 
 SCALES = (RANGE, 10.0, 10.0)
 """Typical sizes of the features of a sector, in their units."""

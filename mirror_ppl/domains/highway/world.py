@@ -57,7 +57,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.base import Observation, Visibility, require_known
 from mirror_ppl.domains.highway import estimate, expert, reward, scenarios, traffic
 from mirror_ppl.domains.highway.estimate import state_with
 from mirror_ppl.domains.highway.knowledge import Memory, imagined, nothing, out_of_sight, remember
@@ -80,6 +80,7 @@ from mirror_ppl.domains.highway.road import (
 )
 from mirror_ppl.domains.highway.speech import DIRECTIONS, NOTHING, SIDES, utterances
 from mirror_ppl.domains.highway.state import HighwayState, where
+from mirror_ppl.domains.modality import Modality
 from mirror_ppl.domains.world import World
 
 FOG_AHEAD, FOG_BEHIND = 15.0, 5.0

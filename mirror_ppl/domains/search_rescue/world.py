@@ -60,7 +60,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.base import Observation, Visibility, require_known
+from mirror_ppl.domains.modality import Modality
 from mirror_ppl.domains.search_rescue.drawing import LEGEND, draw_house
 from mirror_ppl.domains.search_rescue.estimate import nearest_to, state_of
 from mirror_ppl.domains.search_rescue.house import (
