@@ -164,10 +164,15 @@ def _predictions(comparison: Comparison) -> Table:
 def _evidences(comparison: EvidenceComparison) -> Table:
     from rich.text import Text
 
+    from mirror_ppl.evaluation.evidence import prior_share
+
     caption = "log evidence: log marginal likelihood of what all people did, nats; difference: to "
     caption += "the best (log Bayes factor if all people follow one model), ± standard error of "
-    caption += "the estimate; share: of people who follow the model if each follows one, with a "
-    caption += "90% interval"
+    caption += (
+        "the estimate alone; share: of people who follow the model if each follows one, with "
+    )
+    mean, low, high = prior_share(len(comparison.models))
+    caption += f"a 90% interval (before any data {mean:.2f} [{low:.2f}, {high:.2f}])"
     columns = "log evidence", "difference", "share of people"
     table = _empty(comparison, f"evidence, {sum(comparison.rounds)} rounds", caption, columns)
     for rank, model in enumerate(comparison.models, 1):

@@ -46,7 +46,7 @@ CAPABILITIES = (
     Capability("relevance", "everything", "shares of relevant messages"),
     Capability("describe", "names and numbers", "messages in words"),
     Capability("deed", "the action's name", "actions in words"),
-    Capability("render", "a table of numbers", "pictures of states"),
+    Capability("render", "a table of colours", "pictures of states"),
     Capability("reference_values", "left out", "an expert; exact agreement; advice"),
     Capability("reflected", "left out", "with `distil`, twice the rounds: mirror images"),
 )

@@ -29,8 +29,10 @@ EVERYTHING = "anything"
 """Definition of relevance of worlds without one: all items are relevant."""
 PIXELS = 24
 """Width and height of a number in the default picture."""
-TINT = (1.0, 0.85, 0.6)
-"""Factors on red, green and blue of items that a person does not see, in the default picture."""
+POSITIVE, NEGATIVE, BORDER = (0.0, 90.0, 180.0), (200.0, 90.0, 0.0), 128
+"""Colours of the largest and of the least number in the default picture, and of borders."""
+UNSEEN = 0.6
+"""Factor on the brightness of items that a person does not see, in the default picture."""
 
 
 class World(ABC):
@@ -371,23 +373,30 @@ class World(ABC):
         raise DomainError(f"{self.name} has no exact action values (reference_values)")
 
     def render(self, state: Any) -> np.ndarray:
-        """Draw ``uint8 [height, width, 3]``: a row per item, darker for larger features."""
+        """Draw ``uint8 [height, width, 3]``: a row per item, a column per feature.
+
+        Positive numbers are blue, negative ones orange, larger ones darker; 0 is white.
+        """
         visual = next(m for m in self.modalities if m.name == VISUAL)
         items = self.observe(state)[VISUAL].reshape(len(visual.items), -1)
-        share = (items / torch.tensor(visual.scales)).abs().clamp(0, 1)
-        grey = (255 * (1 - share)).to(torch.uint8).numpy()
-        return np.kron(grey, np.ones((PIXELS, PIXELS), np.uint8))[..., None].repeat(3, -1)
+        share = (items / torch.tensor(visual.scales)).clamp(-1, 1)[..., None]
+        full = torch.where(share > 0, torch.tensor(POSITIVE), torch.tensor(NEGATIVE))
+        colours = (255 + share.abs() * (full - 255)).round().to(torch.uint8).numpy()
+        picture = colours.repeat(PIXELS, 0).repeat(PIXELS, 1)
+        picture[::PIXELS] = picture[PIXELS - 1 :: PIXELS] = BORDER
+        picture[:, ::PIXELS] = picture[:, PIXELS - 1 :: PIXELS] = BORDER
+        return picture
 
     def render_seen(self, state: Any, visible: Visibility) -> np.ndarray:
         """Draw a state as a person perceives it who sees items ``[K]``.
 
-        The default is `render`; of worlds without their own `render`, unseen items are tinted.
+        The default is `render`; of worlds without their own `render`, unseen items are darkened.
         """
         picture = self.render(state)
         if offers(self, "render"):
             return picture
         unseen = ~visible[VISUAL].numpy().repeat(PIXELS)
-        picture[unseen] = (picture[unseen] * TINT).astype(np.uint8)
+        picture[unseen] = (UNSEEN * picture[unseen]).astype(np.uint8)
         return picture
 
     def _all(self, observation: Observation, which: Callable[[Modality], bool]) -> Visibility:

@@ -130,6 +130,12 @@ def read_evidence(path: Path) -> EvidenceFile:
             f"{file.path}: each decision counts {power:g} times in it, so that it has no marginal "
             "likelihood; compare held-out rounds with --by heldout"
         )
+    pooling = file.attributes.get("pooling", "none")
+    if unknown and pooling != "none":
+        raise PosteriorError(
+            f"{file.path}: its people were pooled, or have a population as prior, so that they "
+            "have no marginal likelihood of their own; compare them with --by loo or --by heldout"
+        )
     if unknown:
         raise PosteriorError(
             f"{file.path}: holds no marginal likelihood of {', '.join(unknown)}; the engines "
@@ -250,6 +256,15 @@ def check_same(files: Sequence[ComparedFile]) -> None:
         _check_two(files[0], file)
 
 
+def _recorded_alike(first: ComparedFile, other: ComparedFile) -> bool:
+    """True if people and all that was recorded of them are the same."""
+    return first.people == other.people and all(
+        name in other.recorded
+        and np.array_equal(other.recorded[name], value, equal_nan=value.dtype.kind == "f")
+        for name, value in first.recorded.items()
+    )
+
+
 def _check_two(first: ComparedFile, other: ComparedFile) -> None:
     expected, given = source_of(first), source_of(other)
     # The shortest difference is reported, rather than that of the command that recorded.
@@ -260,6 +275,8 @@ def _check_two(first: ComparedFile, other: ComparedFile) -> None:
         key=lambda name: (name != "domain", name == own, len(expected.get(name, "")), name),
     )
     different = f"{other.path}: is of other recordings than {first.path}:"
+    if _recorded_alike(first, other):  # whatever is said of how they were made
+        names = ["domain", "setting"]
     for name in names:
         if given.get(name) != expected.get(name):
             raise PosteriorError(

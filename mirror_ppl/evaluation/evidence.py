@@ -82,6 +82,16 @@ def model_shares(log_evidence: np.ndarray) -> Shares:
     return Shares(np.concatenate(draws), followed / len(draws))
 
 
+def prior_share(models: int) -> tuple[float, float, float]:
+    """Mean and ends of the central interval of a model's share before any data."""
+    # The distribution function of a share is 1 - (1 - x)^(M - 1).
+    levels = ((1 - INTERVAL) / 2, (1 + INTERVAL) / 2)
+    if models == 1:
+        return 1.0, 1.0, 1.0
+    low, high = (1 - (1 - level) ** (1 / (models - 1)) for level in levels)
+    return 1 / models, low, high
+
+
 @dataclass(frozen=True)
 class PersonEvidence:
     """Evidence of one model for one person.

@@ -51,6 +51,8 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
     if several := summary["several_numbers"]:
         names = ", ".join(f"{name} ({prod(shape)})" for name, shape in several.items())
         print(f"Implants of several numbers are in posterior.nc alone: {names}")
+    if prior := summary.get("prior_from"):
+        print(f"Prior: the population of {prior}")
     _show_predictions(summary["people"])
     people, wrong = summary["people"], summary["contradictions"]
     print(_served(people))

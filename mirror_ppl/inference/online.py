@@ -55,8 +55,8 @@ class OnlinePosterior:
         person: id of the person; ``None`` before the first round.
         pareto_k: Pareto k of the importance weights at the last call of ``draws``; above 0.7 they
             are unreliable.
-        effective_draws: as how many independent draws they count; with a network at least 64 are
-            asked for, otherwise 400.
+        effective_draws: as how many independent draws they count; at least 64 are asked for with
+            a network, otherwise 400.
         seconds: duration of the last calls of ``add`` and of ``draws``.
     """
 

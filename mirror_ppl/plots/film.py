@@ -119,8 +119,8 @@ def _legend(domain: Domain) -> str:
     (visual,) = (modality for modality in domain.modalities if modality.name == VISUAL)
     return (
         f"Rows from above: {', '.join(visual.items)}. Columns from the left: "
-        f"{', '.join(visual.features)}; darker for larger numbers. Tinted: what the person neither "
-        "sees nor is shown at this step"
+        f"{', '.join(visual.features)}. Blue: above 0, orange: below, darker for larger ones. "
+        "Darkened rows: what the person neither sees nor is shown at this step"
     )
 
 

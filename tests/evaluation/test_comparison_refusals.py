@@ -152,12 +152,12 @@ OTHERWISE = np.where((ACTIONS >= 0) & (np.arange(4) == 0), 1, ACTIONS).astype("i
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"recorded_seed": "7"}, "seed is 7, expected 0"),
-        ({"recorded_seed": None}, "seed is none, expected 0"),
-        ({"recorded_by": "me"}, "by is me, expected none"),
+        ({"recorded_seed": "7", "ego": 1.0}, "seed is 7, expected 0"),
+        ({"recorded_seed": None, "ego": 1.0}, "seed is none, expected 0"),
+        ({"recorded_by": "me", "ego": 1.0}, "by is me, expected none"),
         # The short name comes before the long command.
         (
-            {"recorded_command": "x", "recorded_population": "diverse"},
+            {"recorded_command": "x", "recorded_population": "diverse", "ego": 1.0},
             "population is diverse, expected paper",
         ),
         ({"setting": "clear"}, "setting is clear, expected fog"),
@@ -175,6 +175,12 @@ def test_other_recordings(paths, tmp_path, capsys, changes, told):
     other = write(tmp_path / "other.nc", **{"likelihood": np.zeros((4, 3))} | changes)
     message = refused(capsys, tmp_path, paths[0], paths[1], other)
     assert message == f"{other}: is of other recordings than {paths[0]}: {told}"
+
+
+def test_the_same_rounds_may_have_other_notes(paths, tmp_path):
+    notes = {"recorded_by": "me", "recorded_seed": None}
+    other = write(tmp_path / "other.nc", likelihood=np.zeros((4, 3)), **notes)
+    assert command(compare, paths[0], other) == 0
 
 
 def test_other_people(paths, tmp_path, capsys, monkeypatch):

@@ -117,6 +117,8 @@ def test_the_command_prints_writes_and_draws(paths, tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "driving, fog: evidence, 7 rounds of 4 people" in shown
     assert "-13.0 ±0.7" in shown and "-100.0" in shown and "share of people" in shown
+    # Of three models the distribution function of a share is 1 - (1 - x)**2.
+    assert "(before any data 0.33 [0.03, 0.78])" in " ".join(shown.split())
     data = json.loads((tmp_path / "x.json").read_text())
     assert (data["by"], data["unit"]) == ("evidence", "nats")
     assert [model["label"] for model in data["models"]] == ["a", "b", "c"]
@@ -146,6 +148,10 @@ def test_whose_evidence_is_missing_is_named(tmp_path):
     message = f"{path}: holds no marginal likelihood of ben, dia; the engines"
     refused(lambda: read_evidence(path), message)
     other = write(tmp_path / "b.nc", evidence=(evidence, np.zeros(4)), likelihood_power=0.25)
+    pooled = write(tmp_path / "c.nc", evidence=(evidence, np.zeros(4)), pooling="partial")
+    refused(
+        lambda: read_evidence(pooled), f"{pooled}: its people were pooled, or have a population"
+    )
     message = "each decision counts 0.25 times in it, so that it has no marginal likelihood"
     refused(lambda: read_evidence(other), message)
 

@@ -116,6 +116,7 @@ def test_a_population_is_a_prior_of_others(inside, capsys):
     for rounds, out in ((0, "none"), (1, "one")):
         args = *QUICK, "--draws", 60, "--train-rounds", rounds, "--out", out
         assert command(fit, *args, "--prior-from", "pooled/posterior.nc") == 0
+        assert "Prior: the population of pooled/posterior.nc" in capsys.readouterr().out
     before, after = (
         az.from_netcdf(f"{name}/posterior.nc")["posterior"] for name in ("none", "one")
     )
