@@ -86,6 +86,13 @@ class OnlinePosterior:
         with forked():
             self._order = tuple(sample_sites(human, 1))
 
+    def __repr__(self) -> str:
+        of = "nobody yet" if self.person is None else self.person
+        text = f"OnlinePosterior of {of}: {type(self.human).__name__}, rounds {self.rounds}"
+        if not math.isnan(self.effective_draws):
+            text += f", effective draws {self.effective_draws:.0f}"
+        return f"<{text}>"
+
     @property
     def rounds(self) -> int:
         """Number of rounds so far."""

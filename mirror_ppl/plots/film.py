@@ -12,17 +12,21 @@ from matplotlib.axes import Axes
 
 from mirror_ppl.domains.base import Domain, Visibility
 from mirror_ppl.domains.derived import VISUAL
-from mirror_ppl.domains.world import offers
+from mirror_ppl.domains.world import PIXELS, offers
 from mirror_ppl.errors import InputError
 from mirror_ppl.plots.picture import Picture, label_of
-from mirror_ppl.plots.reading import BLUE, GREY
+from mirror_ppl.plots.reading import BLUE, GREY, edged
 
 FRAMES = 6
 """Default number of frames."""
 LINE = 0.14
 """Inches of a line of text below a frame."""
+EDGED = {"path_effects": edged(2.0)}
+"""Black text with a white edge, which is read on any colour."""
 CHARACTERS = 14
 """Characters of the legend on an inch of a picture's width."""
+KNOWN = 40
+"""Characters of what people know of themselves above a frame."""
 WIDE = 3.0
 """Ratio of width to height from which communicators stand side by side."""
 
@@ -160,11 +164,12 @@ def _frame(ax: Axes, film: Film, strip: Strip, step: int, characters: int) -> No
     end = len(strip.actions)
     shown = min(step, end)
     ax.imshow(film.domain.render_seen(strip.states[shown], strip.seen[shown]))
+    known = "" if offers(film.domain, "render") else _numbers(ax, film.domain, strip.states[shown])
     if step >= end:
         over = f"the end, step {end}" if step == end else f"over since step {end}"
-        ax.set_title(over, fontsize=9)
+        ax.set_title(over + known, fontsize=9)
         return
-    ax.set_title(f"step {step}", fontsize=9)
+    ax.set_title(f"step {step}{known}", fontsize=9)
     for number, (text, colour) in enumerate(_below(strip, step, characters)):
         ax.annotate(
             text,
@@ -178,6 +183,18 @@ def _frame(ax: Axes, film: Film, strip: Strip, step: int, characters: int) -> No
             color=colour,
             annotation_clip=False,
         )
+
+
+def _numbers(ax: Axes, domain: Domain, state: Any) -> str:
+    """Write numbers into the cells of `World.render`; returns what people know of themselves."""
+    observation = domain.observe(state)
+    for row, features in enumerate(observation[VISUAL].tolist()):
+        for column, value in enumerate(features):
+            place = ((column + 0.5) * PIXELS - 0.5, (row + 0.5) * PIXELS - 0.5)
+            ax.text(*place, f"{value:.3g}", ha="center", va="center", fontsize=11, **EDGED)
+    own = zip(domain.ego_features, observation["ego"].tolist(), strict=True)
+    text = ", ".join(f"{name} {value:.3g}" for name, value in own)
+    return "\n" + textwrap.shorten(text.replace("_", " "), KNOWN)
 
 
 def _below(strip: Strip, step: int, characters: int) -> list[tuple[str, str]]:

@@ -197,11 +197,18 @@ def test_a_world_without_pictures_of_its_own_has_a_table_and_explains_it(listene
         everything = {"visual": torch.ones(len(visual.items), dtype=torch.bool)}
         one = Strip("none", [state, state], [everything] * 2, [[]], ["wait"], [0.0], 0.0, [])
         figure = plot_film(Film(domain, 0, 0, (one, one)), ["ann"], frames=2)
+        frame = figure.subfigs[0].axes[0]
+        written.append([frame.get_title(), *(text.get_text() for text in frame.texts)])
         return [text.get_text().replace("\n", " ") for text in figure.texts]
+
+    written = []
 
     (text,) = [text for text in below(world) if text.startswith("Rows from above: ")]
     assert all(item in text for item in (*visual.items, *visual.features))
+    numbers = {f"{float(state.pot):g}", f"{float(state.puddle):g}"}
+    assert {"step 0\nhas tea 0", *numbers} <= set(written[0])
     assert not [text for text in below(Pictured()) if "Rows from above" in text]
+    assert written[1][0] == "step 0"
 
 
 def people_sees(people, world, state):

@@ -171,3 +171,14 @@ def test_a_network_of_another_model_is_refused(human, network):
 class LatePrior(HumanModel):
     def prior(self):
         return super().prior() | {"late": pyro.sample("late", dist.Beta(1.0, 4.0))}
+
+
+def test_it_says_of_whom_it_is(human, rounds):
+    online = OnlinePosterior(human)
+    name = type(human).__name__
+    assert repr(online) == f"<OnlinePosterior of nobody yet: {name}, rounds 0>"
+    online.add(rounds)
+    of = f"<OnlinePosterior of {rounds.people[0]}: {name}, rounds {online.rounds}"
+    assert repr(online) == of + ">"
+    online.draws(4)
+    assert repr(online) == f"{of}, effective draws {online.effective_draws:.0f}>"
