@@ -78,6 +78,8 @@ def remarks_on(world: World) -> str:
     remark = f"random actions: rewards {min(earned):.3g} to {max(earned):.3g} a step"
     if world.random and not chance:
         remark += "; no step depended on chance, so random may be left out"
+    if world.random or world.partly_observed:
+        remark += "; recordings are not checked against what has to come next"
     if not offers(world, "over"):
         return remark
     remark += f"; {number} of {REMARKED} rounds ended"

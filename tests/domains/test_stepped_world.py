@@ -307,6 +307,8 @@ def test_remarks_say_where_nothing_depends_on_chance():
     calm = type("Calm", (Way,), {"random": True})()
     assert "no step depended on chance, so random may be left out" in remarks_on(calm)
     assert "chance" not in remarks_on(Windy())
+    unchecked = "recordings are not checked against what has to come next"
+    assert unchecked in remarks_on(Windy()) and unchecked not in remarks_on(Way())
     paid = type("Paid", (Way,), {"random": True, "terms": paid_by_chance})()
     assert "chance" not in remarks_on(paid)
 

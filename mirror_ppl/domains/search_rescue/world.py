@@ -263,7 +263,7 @@ class SearchRescue(World):
             "the victim has to be in one room, or carried": (
                 holds[..., 2:].sum(-1) + carrying != 1
             ),
-            "pixels have to show what utterances say": (
+            "visual pixels, from 0 to 1, have to show what verbal items say": (
                 (observation["visual"] - pixels).abs() > 1e-3  # noqa: PLR2004 - of rounding
             ).any((-1, -2)),
         }
