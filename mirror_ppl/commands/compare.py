@@ -139,7 +139,10 @@ def _predictions(comparison: Comparison) -> Table:
     rounds = comparison.models[0].total.rounds
     measured = f"leave-one-out, {rounds} rounds" if left_out else f"{rounds} held-out rounds"
     caption = "nats an action, higher is better; difference: to the best, ± standard error, paired"
-    caption += " over rounds; weight: of each in the mixture that predicts best"
+    caption += (
+        " over rounds; weight: of each in the mixture that predicts best, which a few rounds "
+    )
+    caption += "more may change where differences are within errors"
     if left_out:
         caption += "; doubtful: rounds whose estimate rests on few draws (Pareto k too high)"
         if any(4 * (model.total.doubtful or 0) > rounds for model in comparison.models):

@@ -73,7 +73,7 @@ def _finish(figure: Picture, ax: Axes, by: str, of: str) -> None:
     """Labels, title and legend."""
     unit, error = "nats an action", "± standard error, paired"
     if by == "evidence":
-        unit, error = "nats", "± standard error of the estimate"
+        unit, error = "nats", "± Monte Carlo error of the estimate alone"
     ax.set_xlabel(f"difference to the best in {unit}; further left is worse")
     ax.spines[["top", "right", "left"]].set_visible(False)
     ax.tick_params(axis="y", which="both", length=0, pad=8)

@@ -21,8 +21,8 @@ FRAMES = 6
 """Default number of frames."""
 LINE = 0.14
 """Inches of a line of text below a frame."""
-EDGED = {"path_effects": edged(2.0)}
-"""Black text with a white edge, which is read on any colour."""
+EDGE = 2.0
+"""Points of the white edge of numbers, which are then read on any colour."""
 CHARACTERS = 14
 """Characters of the legend on an inch of a picture's width."""
 KNOWN = 40
@@ -191,7 +191,14 @@ def _numbers(ax: Axes, domain: Domain, state: Any) -> str:
     for row, features in enumerate(observation[VISUAL].tolist()):
         for column, value in enumerate(features):
             place = ((column + 0.5) * PIXELS - 0.5, (row + 0.5) * PIXELS - 0.5)
-            ax.text(*place, f"{value:.3g}", ha="center", va="center", fontsize=11, **EDGED)
+            ax.text(
+                *place,
+                f"{value:.3g}",
+                ha="center",
+                va="center",
+                fontsize=11,
+                path_effects=edged(EDGE),
+            )
     own = zip(domain.ego_features, observation["ego"].tolist(), strict=True)
     text = ", ".join(f"{name} {value:.3g}" for name, value in own)
     return "\n" + textwrap.shorten(text.replace("_", " "), KNOWN)
